@@ -1,0 +1,130 @@
+"""What every loss has, and the three ways in which a loss may couple the unknowns.
+
+A solver knows couplings, not losses: a loss that subclasses one of the three classes below works in both solvers.
+``forward`` is the loss as a scalar of plain tensors, differentiable by autograd; ``linearise`` gives the same residuals
+with their analytic derivatives, laid out coordinate-first for the Gauss-Newton solver.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from typing import NamedTuple
+
+import torch
+from torch import Tensor, nn
+
+from torchstickcal.cameras import Intrinsics
+from torchstickcal.losses.robust import Quadratic, RobustKernel
+
+
+class Loss(nn.Module):
+    """A sum of robust squared residuals in units of their standard deviation.
+
+    Args:
+        sigma: standard deviation of a residual in its own unit; a number, or a tensor with one per point or stick.
+        weight: factor on the whole loss (the paper's lambda).
+        kernel: robust kernel on squared whitened residuals.
+    """
+
+    sigma: Tensor
+
+    def __init__(self, sigma: float | Tensor = 1.0, weight: float = 1.0, kernel: RobustKernel | None = None) -> None:
+        super().__init__()
+        self.register_buffer("sigma", torch.as_tensor(sigma, dtype=torch.float64))
+        self.weight = weight
+        self.kernel = kernel if kernel is not None else Quadratic()
+
+    def total(self, whitened_squared: Tensor) -> Tensor:
+        """The loss of squared whitened residuals, summed."""
+        return self.weight * self.kernel.rho(whitened_squared).sum()
+
+    def information(self, like: Tensor) -> Tensor:
+        """1 / sigma^2 in the dtype and on the device of a tensor."""
+        return self.sigma.to(like).square().reciprocal()
+
+
+class CameraPointTerms(NamedTuple):
+    """A camera-point loss, linearised at C cameras and N points."""
+
+    cost: Tensor
+    """(): the loss"""
+    squares: Tensor
+    """(C,): weighted sum of squared residuals, in pixels"""
+    weights: Tensor
+    """(C,): sum of those weights"""
+    gradient: Tensor
+    """(C, 3, N): half the derivative by the point, in the world's axes"""
+    hessian: Tensor
+    """(C, 6, N): the Gauss-Newton block J^T J by the point, entries xx xy xz yy yz zz"""
+
+
+class PairTerms(NamedTuple):
+    """A loss on pairs of points of one frame, linearised at F frames and S pairs."""
+
+    cost: Tensor
+    """(): the loss"""
+    residual: Tensor
+    """(F, S): weighted residuals"""
+    jacobian: Tensor
+    """(3, F, S): derivative by the pair's second point; by its first point it is the negative"""
+
+
+class TrackTerms(NamedTuple):
+    """A loss on the frames of one point, linearised at F frames and P points: residuals ``stencil * track``."""
+
+    cost: Tensor
+    """(): the loss"""
+    residual: Tensor
+    """(3, F - 2, P): weighted residuals"""
+    scale: Tensor
+    """(F - 2, P): the factor in them; their Jacobian by frames f, f+1, f+2 is scale (1, -2, 1) I"""
+
+
+class CameraPointLoss(Loss, ABC):
+    """Couples one camera and one point: everything that compares a projection with an image."""
+
+    @abstractmethod
+    def forward(
+        self,
+        points: Tensor,
+        rotations: Tensor,
+        translations: Tensor,
+        keypoints: Tensor,
+        intrinsics: Intrinsics | Tensor,
+        confidence: Tensor | None = None,
+    ) -> Tensor:
+        """The loss of points (F, P, 3) in cameras (C, 3, 3), (C, 3) that saw keypoints (C, F, P, 2)."""
+
+    @abstractmethod
+    def cost(self, points_cam: Tensor, pixels: Tensor, information: Tensor, cameras: Intrinsics) -> Tensor:
+        """The loss (); arguments as for :meth:`linearise`, without derivatives."""
+
+    @abstractmethod
+    def linearise(
+        self, points_cam: Tensor, rotations: Tensor, pixels: Tensor, information: Tensor, cameras: Intrinsics
+    ) -> CameraPointTerms:
+        """The terms at N points.
+
+        Args:
+            points_cam: the points in every camera's frame, (C, 3, N).
+            rotations: world to camera, (C, 3, 3).
+            pixels: (C, 2, N).
+            information: confidence / sigma^2, (C, N), zero where not seen.
+            cameras: the C cameras.
+        """
+
+
+class PairLoss(Loss, ABC):
+    """Couples two points of one frame through the vector between them."""
+
+    @abstractmethod
+    def linearise(self, difference: Tensor, length_m: Tensor, active: Tensor) -> PairTerms:
+        """Terms at differences (3, F, S) of the pairs' ends, nominal lengths (S,) and a mask (F, S)."""
+
+
+class TrackLoss(Loss, ABC):
+    """Couples three consecutive frames of one point through their second difference."""
+
+    @abstractmethod
+    def linearise(self, points: Tensor, active: Tensor) -> TrackTerms:
+        """Terms at points (3, F, P) with a mask (F, P) of points that exist."""

@@ -1,0 +1,128 @@
+"""From pairs to a rig: a maximum spanning tree, and poses propagated along it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from torchstickcal.errors import RigError
+from torchstickcal.initialise.pairs import Array, Pair, RelativePose, two_view_depths
+from torchstickcal.initialise.triangulate import triangulate
+
+_PLAUSIBLE_SHARE = 0.5
+
+
+class Edge(NamedTuple):
+    """A branch of the tree: a placed camera and the camera to place from it."""
+
+    parent: int
+    child: int
+    poses: tuple[RelativePose, ...]
+
+
+def spanning_tree(pairs: Sequence[Pair], labels: Sequence[str], min_common: int) -> list[Edge]:
+    """Maximum spanning tree over inlier counts, rooted at the first camera, in the order of growth.
+
+    Raises:
+        RigError: if some camera cannot be reached, naming it and the pairs that fell short.
+    """
+    placed, edges = {0}, list[Edge]()
+    while len(placed) < len(labels):
+        crossing = [p for p in pairs if p.poses and (p.first in placed) != (p.second in placed)]
+        if not crossing:
+            raise _disconnected(pairs, placed, labels, min_common)
+        best = max(crossing, key=lambda p: p.inliers)
+        if best.first in placed:
+            edges.append(Edge(best.first, best.second, best.poses))
+        else:
+            edges.append(Edge(best.second, best.first, tuple(pose.inverse() for pose in best.poses)))
+        placed.add(edges[-1].child)
+    return edges
+
+
+def propagate(
+    edges: Sequence[Edge], rays: Array, visible: NDArray[np.bool_], scale: float
+) -> tuple[Array, Array]:
+    """Poses of all cameras, world to camera, in the frame of the first; the first edge has length 1.
+
+    A pose out of an essential matrix is one of four, and the count of points in front of both cameras does not always
+    tell which: the twisted twin is told from the true one by a third camera, in which it projects the points elsewhere.
+    So the tree is grown from every plausible pose of the first edge, at each edge the pose is taken that the points
+    placed so far support best, and the tree with most support is returned.
+
+    Args:
+        edges: the tree, in order of growth.
+        rays: undistorted, normalised coordinates (C, 2, N).
+        visible: (C, N).
+        scale: residual, in normalised coordinates, up to which a point supports a pose.
+    """
+    first = edges[0].poses
+    plausible = [pose for pose in first if pose.in_front >= _PLAUSIBLE_SHARE * first[0].in_front]
+    trees = [_grow(root, edges, rays, visible, scale) for root in plausible]
+    _, rotations, translations = max(trees, key=lambda tree: tree[0])
+    return rotations, translations
+
+
+def _grow(
+    root: RelativePose, edges: Sequence[Edge], rays: Array, visible: NDArray[np.bool_], scale: float
+) -> tuple[float, Array, Array]:
+    """Support of the tree that starts with a pose of its first edge, and the poses of all cameras."""
+    cameras = len(rays)
+    rotations, translations = np.tile(np.eye(3), (cameras, 1, 1)), np.zeros((cameras, 3))
+    rotations[edges[0].child], translations[edges[0].child] = root.rotation, root.translation
+    placed = [edges[0].parent, edges[0].child]
+    support = float(root.in_front)
+    for edge in edges[1:]:
+        known = triangulate(
+            *(torch.from_numpy(np.ascontiguousarray(v[placed])) for v in (rotations, translations, rays)),
+            torch.from_numpy(visible[placed]).double(),
+            scale=scale,
+        ).numpy()
+        candidates = [_attach(pose, edge, rotations, translations, known, rays, visible, scale) for pose in edge.poses]
+        gained, rotations[edge.child], translations[edge.child] = max(candidates, key=lambda c: c[0])
+        support += gained
+        placed.append(edge.child)
+    return support, rotations, translations
+
+
+def _attach(
+    pose: RelativePose,
+    edge: Edge,
+    rotations: Array,
+    translations: Array,
+    known: Array,
+    rays: Array,
+    visible: NDArray[np.bool_],
+    scale: float,
+) -> tuple[float, Array, Array]:
+    """Support and pose of a camera placed from its parent, the baseline measured on points known already."""
+    parent, child = edge.parent, edge.child
+    common = np.flatnonzero(visible[parent] & visible[child] & np.isfinite(known[0]))
+    depth_known = rotations[parent, 2] @ known[:, common] + translations[parent, 2]
+    depth_pair, _ = two_view_depths(pose.rotation, pose.translation, rays[parent][:, common], rays[child][:, common])
+    usable = (depth_pair > 0) & (depth_known > 0)
+    baseline = float(np.median(depth_known[usable] / depth_pair[usable])) if usable.any() else 1.0
+    rotation = pose.rotation @ rotations[parent]
+    translation = pose.rotation @ translations[parent] + baseline * pose.translation
+    seen = np.flatnonzero(visible[child] & np.isfinite(known[0]))
+    x, y, z = rotation @ known[:, seen] + translation[:, None]
+    z_safe = np.where(np.abs(z) < 1e-9, 1e-9, z)
+    squared = (x / z_safe - rays[child, 0, seen]) ** 2 + (y / z_safe - rays[child, 1, seen]) ** 2
+    return float(((z > 0) / (1 + squared / scale**2)).sum()), rotation, translation
+
+
+def _disconnected(pairs: Sequence[Pair], placed: set[int], labels: Sequence[str], min_common: int) -> RigError:
+    cut_off = [label for index, label in enumerate(labels) if index not in placed]
+    crossing = [p for p in pairs if (p.first in placed) != (p.second in placed)]
+    counts = ", ".join(f"{labels[p.first]} and {labels[p.second]} share {p.common}" for p in crossing)
+    return RigError(
+        "cameras see too little in common to be placed in one rig",
+        where="keypoints",
+        got=f"{', '.join(cut_off)} cut off; {counts}",
+        expected=f"at least {min_common} common points, seen from different places, between some pair",
+        remedy="Use a longer session in which the athlete crosses the views of these cameras, or leave them out.",
+    )

@@ -1,0 +1,118 @@
+"""Relative poses of camera pairs from essential matrices."""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+_CONFIDENCE = 0.9999
+
+
+@dataclass(frozen=True)
+class RelativePose:
+    """One of the four poses an essential matrix stands for: ``x_second = R x_first + s t`` with |t| = 1, s unknown."""
+
+    rotation: Array
+    translation: Array
+    in_front: int
+    """inliers that lie in front of both cameras"""
+
+    def inverse(self) -> RelativePose:
+        """The pose of the first camera relative to the second."""
+        return RelativePose(self.rotation.T, -self.rotation.T @ self.translation, self.in_front)
+
+
+@dataclass(frozen=True)
+class Pair:
+    """Two cameras that see common points."""
+
+    first: int
+    second: int
+    common: int
+    """points both cameras see, counted over all frames"""
+    inliers: int
+    """those that agree with the essential matrix"""
+    poses: tuple[RelativePose, ...]
+    """the four poses, the one with most points in front of both cameras first"""
+
+
+def relative_poses(
+    rays: Array, visible: NDArray[np.bool_], focal_px: Array, *, min_common: int, max_points: int, threshold_px: float
+) -> list[Pair]:
+    """Relate every two cameras with enough common points, by RANSAC over essential matrices.
+
+    Args:
+        rays: undistorted, normalised coordinates (C, 2, N).
+        visible: (C, N).
+        focal_px: (C,), to express the threshold in normalised coordinates.
+        min_common: fewest common points of a pair.
+        max_points: points of a pair that RANSAC looks at, spread evenly over the session; all count for the inliers.
+        threshold_px: distance from the epipolar line up to which a point is an inlier.
+
+    Returns:
+        All pairs, also those with too few common points, which have no poses.
+    """
+    pairs: list[Pair] = []
+    for first, second in itertools.combinations(range(len(rays)), 2):
+        columns = np.flatnonzero(visible[first] & visible[second])
+        if len(columns) < min_common:
+            pairs.append(Pair(first, second, len(columns), 0, ()))
+            continue
+        threshold = threshold_px / float(np.sqrt(focal_px[first] * focal_px[second]))
+        a, b = rays[first][:, columns], rays[second][:, columns]
+        sample = np.linspace(0, len(columns) - 1, min(max_points, len(columns))).astype(int)
+        essential = _essential_matrix(a[:, sample], b[:, sample], threshold)
+        if essential is None:
+            pairs.append(Pair(first, second, len(columns), 0, ()))
+            continue
+        inlier = _sampson_distance(essential, a, b) < threshold
+        poses = _decompose(essential, a[:, inlier], b[:, inlier])
+        pairs.append(Pair(first, second, len(columns), int(inlier.sum()), poses))
+    return pairs
+
+
+def two_view_depths(rotation: Array, translation: Array, a: Array, b: Array) -> tuple[Array, Array]:
+    """Depths (N,) in both cameras at which the rays (2, N) of two views come closest."""
+    from_first = rotation @ _homogeneous(a)
+    from_second = _homogeneous(b)
+    aa, bb = (from_first**2).sum(0), (from_second**2).sum(0)
+    ab = (from_first * from_second).sum(0)
+    at, bt = translation @ from_first, translation @ from_second
+    determinant = np.maximum(aa * bb - ab**2, 1e-15)
+    return (ab * bt - bb * at) / determinant, (aa * bt - ab * at) / determinant
+
+
+def _essential_matrix(a: Array, b: Array, threshold: float) -> Array | None:
+    essential, _ = cv2.findEssentialMat(
+        np.ascontiguousarray(a.T), np.ascontiguousarray(b.T), np.eye(3), cv2.USAC_ACCURATE, _CONFIDENCE, threshold
+    )
+    return None if essential is None or essential.shape[0] < 3 else np.asarray(essential[:3], dtype=np.float64)
+
+
+def _sampson_distance(essential: Array, a: Array, b: Array) -> Array:
+    """First-order distance of point pairs from the epipolar constraint, in normalised coordinates."""
+    lines_b, lines_a = essential @ _homogeneous(a), essential.T @ _homogeneous(b)
+    algebraic = (_homogeneous(b) * lines_b).sum(0)
+    return np.abs(algebraic) / np.sqrt((lines_a[:2] ** 2).sum(0) + (lines_b[:2] ** 2).sum(0) + 1e-300)
+
+
+def _decompose(essential: Array, a: Array, b: Array) -> tuple[RelativePose, ...]:
+    """The four poses of an essential matrix, by falling number of points in front of both cameras."""
+    rotation_1, rotation_2, direction = cv2.decomposeEssentialMat(essential)
+    poses: list[RelativePose] = []
+    for rotation in (rotation_1, rotation_2):
+        depth_a, depth_b = two_view_depths(rotation, direction[:, 0], a, b)
+        for sign in (1.0, -1.0):
+            in_front = int(((sign * depth_a > 0) & (sign * depth_b > 0)).sum())
+            poses.append(RelativePose(np.asarray(rotation), sign * direction[:, 0], in_front))
+    return tuple(sorted(poses, key=lambda pose: -pose.in_front))
+
+
+def _homogeneous(rays: Array) -> Array:
+    return np.concatenate([rays, np.ones_like(rays[:1])])

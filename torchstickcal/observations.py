@@ -1,0 +1,314 @@
+"""What the cameras saw: the one place where input is checked and bad input is refused."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from torchstickcal.cameras import Intrinsics
+from torchstickcal.errors import ObservationError
+
+_LONGEST_STICK_M = 10.0
+
+
+@dataclass(frozen=True)
+class Stick:
+    """A rigid stick: two tracked points and the distance between them.
+
+    Args:
+        start: index of one end among the points P.
+        end: index of the other end.
+        length_m: length in metres.
+    """
+
+    start: int
+    end: int
+    length_m: float
+
+    def __post_init__(self) -> None:
+        if self.start == self.end:
+            raise ObservationError(
+                "a stick needs two different ends", where="Stick", got=f"start = end = {self.start}", expected="two points"
+            )
+        if not (np.isfinite(self.length_m) and self.length_m > 0):
+            raise ObservationError(
+                "stick length is not a length", where="Stick.length_m", got=self.length_m, expected="metres, above 0"
+            )
+        if self.length_m > _LONGEST_STICK_M:
+            raise ObservationError(
+                "stick length looks like millimetres",
+                where="Stick.length_m",
+                got=self.length_m,
+                expected=f"metres, at most {_LONGEST_STICK_M:g}",
+                remedy=f"Divide by 1000: {self.length_m / 1000:g} m.",
+            )
+
+
+@dataclass(frozen=True, eq=False)
+class Observations:
+    """Keypoints of one session with everything known about the cameras and the sticks.
+
+    Args:
+        keypoints: pixels (C, F, P, 2) as detected (distorted), NaN where a point was not seen.
+        intrinsics: camera matrices, (C, 3, 3) or one (3, 3) shared by all.
+        sticks: one stick or several with disjoint ends; empty if the scale comes from elsewhere.
+        distortion: (C, D) or (D,), OpenCV's order, D of 4, 5 or 8; None for perfect lenses.
+        confidence: (C, F, P) in [0, 1], the weight of a keypoint: its variance is divided by it. 0 is not seen.
+        image_size: width and height in pixels, (C, 2) or (2,).
+        fps: frames per second.
+        point_names: P names. camera_names: C names.
+        fisheye: whether ``distortion`` (D = 4) is of OpenCV's fisheye model.
+
+    Arrays, lists and tensors are accepted and kept as tensors with the given values, shape and dtype; results of a
+    calibration come back in the dtype and on the device of ``keypoints``.
+
+    Raises:
+        ObservationError: for anything that cannot be calibrated from.
+    """
+
+    keypoints: Tensor
+    intrinsics: Tensor
+    sticks: tuple[Stick, ...]
+    distortion: Tensor | None = None
+    confidence: Tensor | None = None
+    image_size: Tensor | None = None
+    fps: float | None = None
+    point_names: tuple[str, ...] | None = None
+    camera_names: tuple[str, ...] | None = None
+    fisheye: bool = False
+    visible: Tensor = field(init=False, repr=False, compare=False)
+    """(C, F, P), True where a keypoint is given with a confidence above 0."""
+
+    def __init__(
+        self,
+        keypoints: Any,
+        intrinsics: Any,
+        sticks: Stick | Sequence[Stick],
+        distortion: Any = None,
+        confidence: Any = None,
+        image_size: Any = None,
+        fps: float | None = None,
+        point_names: Sequence[str] | None = None,
+        camera_names: Sequence[str] | None = None,
+        fisheye: bool = False,
+    ) -> None:
+        put = object.__setattr__
+        put(self, "keypoints", _tensor(keypoints, "keypoints"))
+        device = self.keypoints.device
+        put(self, "intrinsics", _tensor(intrinsics, "intrinsics", device))
+        put(self, "sticks", (sticks,) if isinstance(sticks, Stick) else tuple(sticks))
+        for name, value in (("distortion", distortion), ("confidence", confidence), ("image_size", image_size)):
+            put(self, name, None if value is None else _tensor(value, name, device))
+        put(self, "fps", None if fps is None else float(fps))
+        put(self, "point_names", None if point_names is None else tuple(map(str, point_names)))
+        put(self, "camera_names", None if camera_names is None else tuple(map(str, camera_names)))
+        put(self, "fisheye", bool(fisheye))
+        self._check_keypoints()
+        self._check_intrinsics()
+        self._check_confidence()
+        self._check_names_and_rate()
+        visible = self.keypoints.isfinite().all(-1)
+        put(self, "visible", visible if self.confidence is None else visible & (self.confidence > 0))
+        self._check_sticks()
+
+    @property
+    def num_cameras(self) -> int:
+        """C"""
+        return self.keypoints.shape[0]
+
+    @property
+    def num_frames(self) -> int:
+        """F"""
+        return self.keypoints.shape[1]
+
+    @property
+    def num_points(self) -> int:
+        """P, joints and stick ends together"""
+        return self.keypoints.shape[2]
+
+    @property
+    def cameras(self) -> Intrinsics:
+        """The intrinsics of every camera, in float64."""
+        matrix = self.intrinsics.double().expand(self.num_cameras, 3, 3)
+        if self.distortion is None or not bool((self.distortion != 0).any()):
+            return Intrinsics(matrix, None, False)
+        distortion = self.distortion.double()
+        return Intrinsics(matrix, distortion.expand(self.num_cameras, distortion.shape[-1]), self.fisheye)
+
+    def camera_label(self, index: int) -> str:
+        """The camera's name, or its number."""
+        return self.camera_names[index] if self.camera_names else f"camera {index}"
+
+    def point_label(self, index: int) -> str:
+        """The point's name, or its number."""
+        return self.point_names[index] if self.point_names else f"point {index}"
+
+    def point_index(self, name: str) -> int:
+        """The index of a named point.
+
+        Raises:
+            ObservationError: if no point has the name.
+        """
+        if self.point_names is None or name not in self.point_names:
+            raise ObservationError(
+                "no such point", where="point_names", got=repr(name), expected=f"one of {', '.join(self.point_names or ())}"
+            )
+        return self.point_names.index(name)
+
+    def to(self, device: torch.device | str) -> Observations:
+        """The same observations on another device."""
+        return replace(self, keypoints=self.keypoints.to(device))
+
+    def with_stick_length(self, length_m: float) -> Observations:
+        """The same observations with another length for their only stick.
+
+        Raises:
+            ObservationError: if there is not exactly one stick, or the length is not one.
+        """
+        if len(self.sticks) != 1:
+            raise ObservationError(
+                "one length for several sticks", where="sticks", got=f"{len(self.sticks)} sticks", expected="one stick"
+            )
+        return replace(self, sticks=(replace(self.sticks[0], length_m=length_m),))
+
+    def _check_keypoints(self) -> None:
+        keypoints = self.keypoints
+        if keypoints.ndim != 4 or keypoints.shape[-1] != 2 or 0 in keypoints.shape:
+            raise ObservationError(
+                "keypoints have the wrong shape",
+                where="keypoints",
+                got=tuple(keypoints.shape),
+                expected="(cameras, frames, points, 2)",
+            )
+        if self.num_cameras < 2:
+            raise ObservationError(
+                "a rig needs at least two cameras", where="keypoints", got=f"{self.num_cameras} camera", expected="2 or more"
+            )
+        if keypoints.isinf().any():
+            _refuse_first("keypoints hold infinite values", keypoints.isinf().any(-1), keypoints, "finite pixels or NaN")
+        half = keypoints.isnan().any(-1) & ~keypoints.isnan().all(-1)
+        if half.any():
+            _refuse_first("a keypoint has only one coordinate", half, keypoints, "both coordinates, or NaN for both")
+
+    def _check_intrinsics(self) -> None:
+        matrix, cameras = self.intrinsics, self.num_cameras
+        if tuple(matrix.shape) not in {(3, 3), (cameras, 3, 3)}:
+            raise ObservationError(
+                "intrinsics have the wrong shape",
+                where="intrinsics",
+                got=tuple(matrix.shape),
+                expected=f"(3, 3) or ({cameras}, 3, 3)",
+            )
+        for index, camera in enumerate(matrix.reshape(-1, 3, 3)):
+            usable = camera.isfinite().all() and camera[0, 0] > 0 and camera[1, 1] > 0
+            if not (usable and camera[1, 0] == 0 and bool((camera[2] == camera.new_tensor([0, 0, 1])).all())):
+                raise ObservationError(
+                    "a camera matrix is not invertible or not a camera matrix",
+                    where="intrinsics" if matrix.ndim == 2 else f"intrinsics[{index}]",
+                    got=camera.tolist(),
+                    expected="[[fx, s, cx], [0, fy, cy], [0, 0, 1]] with fx, fy > 0, in pixels",
+                )
+        if self.distortion is not None:
+            counts = (4,) if self.fisheye else (4, 5, 8)
+            shape = tuple(self.distortion.shape)
+            if shape[-1:] not in {(n,) for n in counts} or shape[:-1] not in {(), (cameras,)}:
+                raise ObservationError(
+                    "distortion has the wrong shape",
+                    where="distortion",
+                    got=shape,
+                    expected=f"({cameras}, D) or (D,), D of {', '.join(map(str, counts))}",
+                )
+            if not self.distortion.isfinite().all():
+                raise ObservationError(
+                    "distortion is not finite", where="distortion", got=self.distortion.tolist(), expected="finite numbers"
+                )
+        if self.image_size is not None and (
+            tuple(self.image_size.shape) not in {(2,), (cameras, 2)} or not bool((self.image_size > 0).all())
+        ):
+            raise ObservationError(
+                "image size is not usable",
+                where="image_size",
+                got=self.image_size.tolist(),
+                expected=f"(2,) or ({cameras}, 2): width, height in pixels",
+            )
+
+    def _check_confidence(self) -> None:
+        confidence = self.confidence
+        if confidence is None:
+            return
+        if confidence.shape != self.keypoints.shape[:3]:
+            raise ObservationError(
+                "confidence has the wrong shape",
+                where="confidence",
+                got=tuple(confidence.shape),
+                expected=f"{tuple(self.keypoints.shape[:3])}, one per keypoint",
+            )
+        outside = ~((confidence >= 0) & (confidence <= 1)) & ~self.keypoints.isnan().all(-1)
+        if outside.any():
+            _refuse_first("confidence outside [0, 1]", outside, confidence, "a number from 0 to 1", where="confidence")
+
+    def _check_names_and_rate(self) -> None:
+        for where, names, count in (
+            ("point_names", self.point_names, self.num_points),
+            ("camera_names", self.camera_names, self.num_cameras),
+        ):
+            if names is not None and (len(names) != count or len(set(names)) != count):
+                raise ObservationError(
+                    "names do not fit the keypoints", where=where, got=names, expected=f"{count} different names"
+                )
+        if self.fps is not None and not (np.isfinite(self.fps) and self.fps > 0):
+            raise ObservationError("frame rate is not usable", where="fps", got=self.fps, expected="a number above 0")
+
+    def _check_sticks(self) -> None:
+        ends: list[int] = []
+        for number, stick in enumerate(self.sticks):
+            where = f"sticks[{number}]"
+            if not isinstance(stick, Stick):
+                raise ObservationError("not a stick", where=where, got=repr(stick), expected="Stick(start, end, length_m)")
+            if not (0 <= stick.start < self.num_points and 0 <= stick.end < self.num_points):
+                raise ObservationError(
+                    "a stick's end is not a tracked point",
+                    where=where,
+                    got=f"start {stick.start}, end {stick.end}",
+                    expected=f"indices from 0 to {self.num_points - 1}",
+                )
+            ends += [stick.start, stick.end]
+            if len(set(ends)) != len(ends):
+                raise ObservationError(
+                    "two sticks share an end", where=where, got=f"start {stick.start}, end {stick.end}", expected="disjoint ends"
+                )
+            views = self.visible.sum(0)
+            if not bool(((views[:, stick.start] >= 2) & (views[:, stick.end] >= 2)).any()):
+                raise ObservationError(
+                    "a stick is never seen by two cameras",
+                    where=where,
+                    got=f"at most {int(views[:, stick.start].max())} cameras at its start and "
+                    f"{int(views[:, stick.end].max())} at its end in one frame",
+                    expected="some frame in which each end is seen by two cameras or more",
+                    remedy="Check the stick's point indices and the detector's threshold.",
+                )
+
+
+def _tensor(value: Any, name: str, device: torch.device | None = None) -> Tensor:
+    try:
+        tensor = value if isinstance(value, Tensor) else torch.as_tensor(np.asarray(value))
+    except (TypeError, ValueError) as error:
+        raise ObservationError("not an array of numbers", where=name, got=type(value).__name__, expected="numbers") from error
+    if tensor.is_complex() or tensor.dtype == torch.bool:
+        raise ObservationError("not an array of real numbers", where=name, got=tensor.dtype, expected="real numbers")
+    return tensor.to(device=device, dtype=tensor.dtype if tensor.is_floating_point() else torch.float64)
+
+
+def _refuse_first(what: str, bad: Tensor, values: Tensor, expected: str, where: str = "keypoints") -> None:
+    camera, frame, point = (int(i) for i in bad.nonzero()[0])
+    raise ObservationError(
+        what,
+        where=f"{where}[{camera}, {frame}, {point}]",
+        got=f"{values[camera, frame, point].tolist()} ({int(bad.sum())} such in all)",
+        expected=expected,
+    )

@@ -1,0 +1,124 @@
+"""One session in the solvers' layout: float64, coordinates first, points of all frames side by side.
+
+Everything a solver touches in its inner loop is a tensor (C, k, N) or (k, N), N = F P with the frame varying slowest, so
+that a slice of frames is a contiguous slice of columns.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from torchstickcal import se3
+from torchstickcal.cameras import Intrinsics
+from torchstickcal.observations import Observations
+
+_CHUNK_KEYPOINTS = 16384
+
+
+@dataclass(frozen=True)
+class Measurements:
+    """What is known: pixels, weights, cameras and sticks.
+
+    Args:
+        pixels: (C, 2, N), zero where not seen.
+        confidence: (C, N), zero where not seen and at points fewer than two cameras see.
+        cameras: intrinsics of the C cameras.
+        frames: F.
+        pairs: (S, 2), the points that are ends of one stick.
+        lengths_m: (S,), the sticks' lengths.
+    """
+
+    pixels: Tensor
+    confidence: Tensor
+    cameras: Intrinsics
+    frames: int
+    pairs: Tensor
+    lengths_m: Tensor
+
+    @staticmethod
+    def of(observations: Observations, use: Collection[int] | None = None) -> Measurements:
+        """The measurements of observations; ``use`` restricts them to some of the points."""
+        keypoints = observations.keypoints.double()
+        visible = observations.visible
+        if use is not None:
+            kept = torch.zeros(observations.num_points, dtype=torch.bool, device=visible.device)
+            kept[list(use)] = True
+            visible = visible & kept
+        visible = visible & (visible.sum(0) >= 2)
+        confidence = visible.double() if observations.confidence is None else observations.confidence.double()
+        sticks = [s for s in observations.sticks if use is None or {s.start, s.end} <= set(use)]
+        return Measurements(
+            pixels=torch.where(visible[..., None], keypoints, 0.0).movedim(-1, 1).flatten(2).contiguous(),
+            confidence=torch.where(visible, confidence, 0.0).flatten(1),
+            cameras=observations.cameras,
+            frames=observations.num_frames,
+            pairs=torch.tensor([(s.start, s.end) for s in sticks], dtype=torch.long).view(-1, 2).to(keypoints.device),
+            lengths_m=torch.tensor([s.length_m for s in sticks], dtype=torch.float64).to(keypoints.device),
+        )
+
+    @property
+    def visible(self) -> Tensor:
+        """(C, N), True where a keypoint counts."""
+        return self.confidence > 0
+
+    @property
+    def active(self) -> Tensor:
+        """(N,), True where two cameras or more see the point."""
+        return self.visible.any(0)
+
+    @property
+    def pair_active(self) -> Tensor:
+        """(F, S), True where both ends of a stick are active."""
+        return self.by_frame(self.active)[:, self.pairs].all(-1)
+
+    @property
+    def points_per_frame(self) -> int:
+        """P"""
+        return self.confidence.shape[1] // self.frames
+
+    def chunks(self) -> list[slice]:
+        """Slices of the columns, whole frames each, small enough for the arrays of one to stay in the cache."""
+        cameras, columns = self.confidence.shape
+        width = self.points_per_frame * max(1, _CHUNK_KEYPOINTS // (self.points_per_frame * cameras))
+        return [slice(first, min(first + width, columns)) for first in range(0, columns, width)]
+
+    def stick_lengths_m(self, points: Tensor) -> Tensor:
+        """Lengths (F, S) of the sticks among points (3, N); NaN in frames where an end is not active."""
+        ends = self.by_frame(points)[..., self.pairs]
+        return (ends[..., 1] - ends[..., 0]).square().sum(0).sqrt().where(self.pair_active, torch.nan)
+
+    def by_frame(self, columns: Tensor) -> Tensor:
+        """A tensor (..., N) as (..., F, P)."""
+        return columns.unflatten(-1, (self.frames, -1))
+
+
+@dataclass(frozen=True)
+class State:
+    """The unknowns: rotations (C, 3, 3) and translations (C, 3) world to camera, points (3, N) in metres."""
+
+    rotations: Tensor
+    translations: Tensor
+    points: Tensor
+
+    def scaled(self, factor: float) -> State:
+        """The same scene, ``factor`` times as large."""
+        return replace(self, translations=self.translations * factor, points=self.points * factor)
+
+    def retracted(self, camera_step: Tensor, point_step: Tensor) -> State:
+        """The state after tangent steps (C - 1, 6) of all cameras but the first and steps (3, N) of the points."""
+        rotations, translations = self.rotations.clone(), self.translations.clone()
+        moved = se3.retract(self.rotations[1:], self.translations[1:], camera_step)
+        rotations[1:], translations[1:] = moved
+        return State(rotations, translations, self.points + point_step)
+
+    def moved(self, point_step: Tensor) -> State:
+        """The state after steps (3, N) of the points alone."""
+        return replace(self, points=self.points + point_step)
+
+    def in_cameras(self, columns: slice = slice(None)) -> Tensor:
+        """The points in every camera's frame, (C, 3, N)."""
+        return self.rotations @ self.points[:, columns] + self.translations[..., None]

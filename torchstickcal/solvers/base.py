@@ -1,0 +1,89 @@
+"""What every solver takes and gives: when to stop, why it stopped, and a record of each iteration."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from enum import StrEnum
+from typing import Protocol
+
+from torchstickcal.objective import Objective
+from torchstickcal.problem import State
+
+
+class Stop(StrEnum):
+    """Why a solver stopped; the value is the sentence to show."""
+
+    COST = "converged: the cost no longer falls"
+    STEP = "converged: the step is negligible"
+    EXACT = "converged: the residuals are at rounding"
+    ITERATIONS = "stopped at the limit of iterations"
+    DIVERGED = "stopped: no step lowers the cost"
+
+    @property
+    def converged(self) -> bool:
+        """Whether the state is a minimum to the tolerance asked for."""
+        return self in {Stop.COST, Stop.STEP, Stop.EXACT}
+
+
+@dataclass(frozen=True)
+class Termination:
+    """When to stop.
+
+    Args:
+        max_iterations: limit of iterations, each one evaluation of the derivatives.
+        cost_tolerance: relative decrease of the cost, promised or reached, below which it has converged.
+        step_tolerance_m: largest movement of a camera or point below which it has converged, metres.
+    """
+
+    max_iterations: int = 100
+    cost_tolerance: float = 1e-9
+    step_tolerance_m: float = 1e-12
+
+
+@dataclass(frozen=True)
+class IterationRecord:
+    """One iteration of one stage."""
+
+    stage: str
+    iteration: int
+    cost: float
+    terms: dict[str, float]
+    """value of each loss; they add up to the cost"""
+    damping: float
+    """Levenberg-Marquardt's factor; 0 where the solver has none"""
+    step_m: float
+    """largest movement of a camera or point by the step that led here, metres"""
+    reprojection_px: tuple[float, ...]
+    """weighted root mean square reprojection residual of each camera"""
+    stick_length_m: float
+    """mean length of the reconstructed sticks; NaN without sticks"""
+
+
+Listener = Callable[[IterationRecord], None]
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """Where a solver ended, why, and how it got there."""
+
+    state: State
+    stop: Stop
+    iterations: tuple[IterationRecord, ...]
+
+
+class Solver(Protocol):
+    """Minimises an objective from a state."""
+
+    def __call__(
+        self,
+        objective: Objective,
+        state: State,
+        *,
+        cameras_free: bool,
+        termination: Termination,
+        stage: str,
+        listener: Listener,
+    ) -> Outcome:
+        """Minimise; the first camera, or with ``cameras_free=False`` every camera, stays where it is."""
+        ...

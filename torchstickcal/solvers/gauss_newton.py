@@ -1,0 +1,96 @@
+"""Levenberg-Marquardt on the exactly reduced system; robust kernels by iteratively re-weighted least squares."""
+
+from __future__ import annotations
+
+import math
+
+from torchstickcal.objective import Objective
+from torchstickcal.problem import State
+from torchstickcal.solvers.base import IterationRecord, Listener, Outcome, Stop, Termination
+from torchstickcal.solvers.normal_equations import NormalEquations, Step, linearise
+
+_INITIAL_DAMPING = 1e-4
+_MIN_DAMPING = 1e-10
+_MAX_DAMPING = 1e8
+_EXACT_COST_PER_KEYPOINT = 1e-18
+
+
+def gauss_newton(
+    objective: Objective,
+    state: State,
+    *,
+    cameras_free: bool,
+    termination: Termination,
+    stage: str,
+    listener: Listener,
+) -> Outcome:
+    """Minimise an objective over the points and, unless held, all cameras but the first.
+
+    A step is taken only if it lowers the cost, so the state returned is never worse than the one given.
+    """
+    damping, step_m = _INITIAL_DAMPING, 0.0
+    exact = _EXACT_COST_PER_KEYPOINT * float(objective.measurements.visible.sum())
+    records: list[IterationRecord] = []
+    stop = Stop.ITERATIONS
+    system = linearise(objective, state, cameras_free)
+    for iteration in range(termination.max_iterations + 1):
+        records.append(_record(system, state, stage, iteration, damping, step_m))
+        listener(records[-1])
+        if system.cost <= exact:
+            stop = Stop.EXACT
+            break
+        if iteration == termination.max_iterations:
+            break
+        moved = _descend(objective, state, system, damping, termination)
+        if isinstance(moved, Stop):
+            stop = moved
+            break
+        state, step_m, damping, decrease = moved
+        converged = decrease <= termination.cost_tolerance * system.cost
+        if converged or step_m <= termination.step_tolerance_m:
+            stop = Stop.COST if converged else Stop.STEP
+            break
+        system = linearise(objective, state, cameras_free)
+    return Outcome(state, stop, tuple(records))
+
+
+def _descend(
+    objective: Objective, state: State, system: NormalEquations, damping: float, termination: Termination
+) -> tuple[State, float, float, float] | Stop:
+    """The next state, the size of the step to it, the next damping and the decrease; or why there is none."""
+    while damping <= _MAX_DAMPING:
+        step = system.step(damping)
+        if step is not None:
+            if step.predicted_decrease <= 0.01 * termination.cost_tolerance * system.cost:
+                return Stop.COST
+            candidate = state.retracted(step.cameras, step.points) if len(step.cameras) else state.moved(step.points)
+            decrease = system.cost - objective.cost(candidate)
+            if decrease > 0:
+                agreement = decrease / step.predicted_decrease
+                shrink = 0.1 if agreement > 0.75 else 1.0 if agreement > 0.25 else 4.0
+                return candidate, _largest_movement(step), max(damping * shrink, _MIN_DAMPING), decrease
+            if step.predicted_decrease <= termination.cost_tolerance * system.cost:
+                return Stop.COST
+        damping = max(damping, 1e-8) * 10
+    return Stop.DIVERGED
+
+
+def _largest_movement(step: Step) -> float:
+    cameras = float(step.cameras.abs().max()) if step.cameras.numel() else 0.0
+    return max(cameras, float(step.points.abs().max()))
+
+
+def _record(
+    system: NormalEquations, state: State, stage: str, iteration: int, damping: float, step_m: float
+) -> IterationRecord:
+    lengths = system.objective.measurements.stick_lengths_m(state.points)
+    return IterationRecord(
+        stage=stage,
+        iteration=iteration,
+        cost=system.cost,
+        terms=system.terms,
+        damping=damping,
+        step_m=step_m,
+        reprojection_px=tuple(system.reprojection_px.tolist()),
+        stick_length_m=float(lengths.nanmean()) if lengths.numel() else math.nan,
+    )

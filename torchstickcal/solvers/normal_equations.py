@@ -1,0 +1,262 @@
+"""The Gauss-Newton system of an objective, reduced to the cameras by exact elimination of the structure.
+
+With the world-side perturbation ``T <- T Exp(delta)`` the derivative of a projection by its camera is its derivative by
+the point times ``B(X) = [I, -[X]x]``, the same for all cameras. So everything follows from one 3 x 3 block N and one
+gradient g per camera and point: H_xx = sum_c N_c, H_xc = N_c B, H_cc = sum B^T N_c B. With H_xx = L L^T and W = L^-1 H_xc
+the reduced camera system is S = H_cc - W^T W.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from torchstickcal import se3
+from torchstickcal.objective import Objective
+from torchstickcal.problem import State
+from torchstickcal.solvers.point_elimination import PointElimination, StickCoupling, outer
+from torchstickcal.solvers.track_elimination import TrackElimination
+
+
+class Step(NamedTuple):
+    """A step of the unknowns and the decrease of the cost that the quadratic model promises for it."""
+
+    cameras: Tensor
+    """(C - 1, 6) tangents, (0, 6) where the cameras are held"""
+    points: Tensor
+    """(3, N), metres"""
+    predicted_decrease: float
+
+
+@dataclass(frozen=True)
+class NormalEquations:
+    """The undamped system at one state; C' is the number of cameras solved for (all but the first, or none)."""
+
+    terms: dict[str, float]
+    """value of each loss"""
+    reprojection_px: Tensor
+    """(C,), weighted root mean square of the reprojection residuals"""
+    points: Tensor
+    """(3, N), where the system was built"""
+    camera_hessian: Tensor
+    """(C', 6, 6), blocks H_cc"""
+    camera_gradient: Tensor
+    """(C', 6)"""
+    cross: Tensor
+    """(C', 6, N), the blocks N_c, entries xx xy xz yy yz zz"""
+    point_hessian: Tensor
+    """(6, N), diagonal blocks H_xx"""
+    point_gradient: Tensor
+    """(3, N)"""
+    objective: Objective
+    pair_coupling: Tensor | None
+    """(6, F, S), minus the blocks between a stick's ends"""
+    next_frame: Tensor | None
+    second_frame: Tensor | None
+    """multiples of the identity between a point's frames, (F - 1, P) and (F - 2, P)"""
+
+    @property
+    def cost(self) -> float:
+        """The objective's value."""
+        return sum(self.terms.values())
+
+    def step(self, damping: float) -> Step | None:
+        """The Levenberg-Marquardt step; None where the damped system is not positive definite.
+
+        Args:
+            damping: factor by which the diagonal of the Hessian is raised.
+        """
+        reduced, rhs, slices = self._reduce(damping)
+        factor, failed = torch.linalg.cholesky_ex(reduced)
+        if int(failed) or not bool(factor.isfinite().all()):
+            return None
+        camera_step = -torch.cholesky_solve(rhs[:, None], factor).view(-1, 6)
+        twists = se3.hat(camera_step[:, 3:])
+        point_step = torch.empty_like(self.point_gradient)
+        for columns, elimination in slices:
+            moved = twists @ self.points[:, columns] + camera_step[:, :3, None]
+            carried = _symmetric_times(self.cross[:, :, columns], moved).sum(0)
+            point_step[:, columns] = -elimination.solve(self.point_gradient[:, columns] + carried)
+        diagonal = self.point_hessian[[0, 3, 5]]
+        decrease = -float((self.camera_gradient * camera_step).sum() + (self.point_gradient * point_step).sum())
+        camera_diagonal = self.camera_hessian.diagonal(dim1=1, dim2=2)
+        decrease += damping * float((camera_diagonal * camera_step**2).sum() + (diagonal * point_step**2).sum())
+        return Step(camera_step, point_step, decrease)
+
+    def reduced_system(self, damping: float = 0.0) -> tuple[Tensor, Tensor]:
+        """The reduced camera system: S (6 C', 6 C') and its right-hand side's negative (6 C',)."""
+        reduced, rhs, _ = self._reduce(damping)
+        return reduced, rhs
+
+    def _reduce(self, damping: float) -> tuple[Tensor, Tensor, list[tuple[slice, PointElimination | TrackElimination]]]:
+        count = self.camera_hessian.shape[0]
+        reduced = torch.block_diag(*_damped(self.camera_hessian, damping)) if count else self.cross.new_zeros(0, 0)
+        rhs = self.camera_gradient.flatten().clone()
+        slices: list[tuple[slice, PointElimination | TrackElimination]] = []
+        for columns in self._slices():
+            elimination = self._eliminate(columns, damping)
+            if count:
+                half = elimination.half_solve(_times_b(self.cross[:, :, columns], self.points[:, columns]).flatten(0, 1))
+                reduced -= half @ half.mT
+                rhs -= half @ elimination.half_solve(self.point_gradient[None, :, columns])[0]
+            slices.append((columns, elimination))
+        return reduced, rhs, slices
+
+    def _slices(self) -> list[slice]:
+        return [slice(None)] if self.next_frame is not None else self.objective.measurements.chunks()
+
+    def _eliminate(self, columns: slice, damping: float) -> PointElimination | TrackElimination:
+        m = self.objective.measurements
+        hessian = self.point_hessian[:, columns].clone()
+        hessian[[0, 3, 5]] *= 1 + damping
+        if self.next_frame is not None and self.second_frame is not None:
+            return TrackElimination(m.by_frame(hessian), m.pairs, self.pair_coupling, self.next_frame, self.second_frame)
+        if self.pair_coupling is None:
+            return PointElimination(hessian, None)
+        points = m.points_per_frame
+        frames = torch.arange(hessian.shape[1] // points, device=hessian.device)
+        first = (columns.start or 0) // points
+        blocks = self.pair_coupling[:, first : first + len(frames)]
+        starts, ends = ((frames[:, None] * points + end).flatten() for end in m.pairs.unbind(1))
+        return PointElimination(hessian, StickCoupling(starts, ends, blocks.flatten(1)))
+
+
+def linearise(objective: Objective, state: State, cameras_free: bool) -> NormalEquations:
+    """Build the Gauss-Newton system of an objective at a state.
+
+    Args:
+        objective: the losses on their session.
+        state: where.
+        cameras_free: whether the cameras are unknowns; the first one never is.
+    """
+    m = objective.measurements
+    free = slice(1, None) if cameras_free else slice(0, 0)
+    cameras, total = m.confidence.shape
+    count = cameras - 1 if cameras_free else 0
+    points = state.points
+    terms = dict.fromkeys(objective.losses, 0.0)
+    squares, weights = points.new_zeros(cameras), points.new_zeros(cameras)
+    cross = points.new_empty(count, 6, total)
+    point_hessian, point_gradient = points.new_zeros(6, total), points.new_zeros(3, total)
+    gradient_moments, hessian_moments = points.new_zeros(count, 3, 4), points.new_zeros(count, 6, 10)
+    for columns in m.chunks():
+        homogeneous = torch.cat([torch.ones_like(points[:1, columns]), points[:, columns]])
+        products = homogeneous[_PRODUCTS[0]] * homogeneous[_PRODUCTS[1]]
+        cross[:, :, columns] = 0
+        for name, block in objective.linearise_chunk(state, columns).items():
+            terms[name] += float(block.cost)
+            squares += block.squares
+            weights += block.weights
+            point_hessian[:, columns] += block.hessian.sum(0)
+            point_gradient[:, columns] += block.gradient.sum(0)
+            cross[:, :, columns] += block.hessian[free]
+            gradient_moments += block.gradient[free] @ homogeneous.mT
+            hessian_moments += block.hessian[free] @ products.mT
+    point_hessian[:, ~m.active] = point_hessian.new_tensor([1.0, 0, 0, 1, 0, 1])[:, None]
+    pair_coupling = _add_pairs(objective, state, terms, m.by_frame(point_hessian), m.by_frame(point_gradient))
+    bands = _add_tracks(objective, state, terms, m.by_frame(point_hessian), m.by_frame(point_gradient))
+    return NormalEquations(
+        terms=terms,
+        reprojection_px=(squares / weights.clamp_min(1e-300)).sqrt(),
+        points=points,
+        camera_hessian=_camera_hessian(hessian_moments),
+        camera_gradient=_camera_gradient(gradient_moments),
+        cross=cross,
+        point_hessian=point_hessian,
+        point_gradient=point_gradient,
+        objective=objective,
+        pair_coupling=pair_coupling,
+        next_frame=bands[0],
+        second_frame=bands[1],
+    )
+
+
+def _add_pairs(objective: Objective, state: State, terms: dict[str, float], hessian: Tensor, gradient: Tensor) -> Tensor | None:
+    """Add the pair losses to the points' blocks (6, F, P) and (3, F, P); returns the coupling (6, F, S)."""
+    coupling: Tensor | None = None
+    starts, ends = objective.measurements.pairs.unbind(1)
+    for name, pair in objective.linearise_pairs(state).items():
+        terms[name] += float(pair.cost)
+        block, slope = outer(pair.jacobian), pair.jacobian * pair.residual
+        hessian[..., starts] += block
+        hessian[..., ends] += block
+        gradient[..., starts] -= slope
+        gradient[..., ends] += slope
+        coupling = block if coupling is None else coupling + block
+    return coupling
+
+
+def _add_tracks(
+    objective: Objective, state: State, terms: dict[str, float], hessian: Tensor, gradient: Tensor
+) -> tuple[Tensor | None, Tensor | None]:
+    """Add the track losses to the points' blocks; returns the couplings to the next and the second-next frame."""
+    if not objective.couples_frames:
+        return None, None
+    next_frame, second_frame = (hessian.new_zeros(hessian.shape[1] - k, hessian.shape[2]) for k in (1, 2))
+    frames = second_frame.shape[0]
+    for name, track in objective.linearise_tracks(state).items():
+        terms[name] += float(track.cost)
+        information = track.scale.square()
+        for offset, factor in enumerate((1.0, -2.0, 1.0)):
+            gradient[:, offset : offset + frames] += factor * track.scale * track.residual
+            hessian[[0, 3, 5], offset : offset + frames] += factor**2 * information
+        next_frame[:-1] -= 2 * information
+        next_frame[1:] -= 2 * information
+        second_frame += information
+    return next_frame, second_frame
+
+
+def _times_b(blocks: Tensor, points: Tensor) -> Tensor:
+    """``(N B(X))^T`` as (C', 6, 3, n): first index the camera's tangent, second the point's axis."""
+    xx, xy, xz, yy, yz, zz = blocks.unbind(1)
+    product = blocks.new_empty(blocks.shape[0], 6, 3, blocks.shape[2])
+    product[:, 0, 0], product[:, 0, 1], product[:, 0, 2] = xx, xy, xz
+    product[:, 1, 0], product[:, 1, 1], product[:, 1, 2] = xy, yy, yz
+    product[:, 2, 0], product[:, 2, 1], product[:, 2, 2] = xz, yz, zz
+    x, y, z = points
+    column_x, column_y, column_z = product[:, 0], product[:, 1], product[:, 2]
+    torch.mul(column_z, y, out=product[:, 3]).addcmul_(column_y, z, value=-1)
+    torch.mul(column_x, z, out=product[:, 4]).addcmul_(column_z, x, value=-1)
+    torch.mul(column_y, x, out=product[:, 5]).addcmul_(column_x, y, value=-1)
+    return product
+
+
+def _symmetric_times(blocks: Tensor, vectors: Tensor) -> Tensor:
+    """N v for symmetric blocks (C', 6, n) and vectors (C', 3, n)."""
+    xx, xy, xz, yy, yz, zz = blocks.unbind(1)
+    x, y, z = vectors.unbind(1)
+    return torch.stack([xx * x + xy * y + xz * z, xy * x + yy * y + yz * z, xz * x + yz * y + zz * z], dim=1)
+
+
+def _damped(blocks: Tensor, damping: float) -> Tensor:
+    return blocks + damping * blocks.diagonal(dim1=1, dim2=2).diag_embed()
+
+
+_PRODUCTS = ([0, 0, 0, 0, 1, 1, 1, 2, 2, 3], [0, 1, 2, 3, 1, 2, 3, 2, 3, 3])
+"""The ten distinct products of the homogeneous coordinates (1, x, y, z)."""
+
+
+def _jacobian_basis() -> Tensor:
+    """(4, 3, 6): B(X) = sum_a (1, X)_a basis_a."""
+    basis = torch.zeros(4, 3, 6, dtype=torch.float64)
+    basis[0, :, :3] = torch.eye(3, dtype=torch.float64)
+    basis[1:, :, 3:] = -se3.hat(torch.eye(3, dtype=torch.float64))
+    return basis
+
+
+def _camera_gradient(moments: Tensor) -> Tensor:
+    """(C', 6): sum over points of B^T g, from the moments (C', 3, 4) of g with (1, x, y, z)."""
+    return torch.einsum("cia,aip->cp", moments, _jacobian_basis().to(moments))
+
+
+def _camera_hessian(moments: Tensor) -> Tensor:
+    """(C', 6, 6): sum over points of B^T N B, from the moments (C', 6, 10) of N with the products."""
+    basis = _jacobian_basis().to(moments)
+    rows = torch.tensor([[0, 1, 2], [1, 3, 4], [2, 4, 5]])
+    pairs = torch.empty(4, 4, dtype=torch.long)
+    pairs[_PRODUCTS] = pairs[_PRODUCTS[::-1]] = torch.arange(10)
+    full = moments[:, rows][..., pairs]
+    return torch.einsum("aip,cijab,bjq->cpq", basis, full, basis)
