@@ -3,34 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 import torch
 
+from torchstickcal.config import InitialiseSettings
 from torchstickcal.initialise.graph import propagate, spanning_tree
 from torchstickcal.initialise.pairs import relative_poses
 from torchstickcal.initialise.triangulate import triangulate
 from torchstickcal.problem import Measurements, State
 
-__all__ = ["InitialiseSettings", "initialise"]
+__all__ = ["initialise"]
+
 
 _SUPPORT_RADIUS = 10.0
-
-
-@dataclass(frozen=True)
-class InitialiseSettings:
-    """How the first estimate is made.
-
-    Args:
-        min_common_points: fewest points, over all frames, that relate two cameras.
-        max_points: points of a pair that RANSAC looks at.
-        threshold_px: distance from the epipolar line up to which a point agrees with a pair.
-    """
-
-    min_common_points: int = 20
-    max_points: int = 200
-    threshold_px: float = 2.0
 
 
 def initialise(measurements: Measurements, settings: InitialiseSettings, labels: Sequence[str]) -> State:

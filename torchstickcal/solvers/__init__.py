@@ -1,0 +1,19 @@
+"""Two solvers behind one interface: Gauss-Newton with exact elimination, and torch.optim.LBFGS."""
+
+from __future__ import annotations
+
+from torchstickcal.solvers.base import IterationRecord, Listener, Outcome, Solver, Stop, Termination
+from torchstickcal.solvers.gauss_newton import gauss_newton
+
+__all__ = ["SOLVERS", "IterationRecord", "Listener", "Outcome", "Solver", "Stop", "Termination", "gauss_newton", "solver"]
+
+SOLVERS = ("gauss_newton", "lbfgs")
+
+
+def solver(name: str) -> Solver:
+    """The solver of a name in ``SOLVERS``; kornia is imported only for the one that needs it."""
+    if name == "lbfgs":
+        from torchstickcal.solvers.lbfgs import lbfgs
+
+        return lbfgs
+    return gauss_newton

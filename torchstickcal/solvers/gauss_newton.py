@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import math
-
 from torchstickcal.objective import Objective
 from torchstickcal.problem import State
 from torchstickcal.solvers.base import IterationRecord, Listener, Outcome, Stop, Termination
@@ -34,7 +32,7 @@ def gauss_newton(
     stop = Stop.ITERATIONS
     system = linearise(objective, state, cameras_free)
     for iteration in range(termination.max_iterations + 1):
-        records.append(_record(system, state, stage, iteration, damping, step_m))
+        records.append(system.record(stage, iteration, damping, step_m))
         listener(records[-1])
         if system.cost <= exact:
             stop = Stop.EXACT
@@ -78,19 +76,3 @@ def _descend(
 def _largest_movement(step: Step) -> float:
     cameras = float(step.cameras.abs().max()) if step.cameras.numel() else 0.0
     return max(cameras, float(step.points.abs().max()))
-
-
-def _record(
-    system: NormalEquations, state: State, stage: str, iteration: int, damping: float, step_m: float
-) -> IterationRecord:
-    lengths = system.objective.measurements.stick_lengths_m(state.points)
-    return IterationRecord(
-        stage=stage,
-        iteration=iteration,
-        cost=system.cost,
-        terms=system.terms,
-        damping=damping,
-        step_m=step_m,
-        reprojection_px=tuple(system.reprojection_px.tolist()),
-        stick_length_m=float(lengths.nanmean()) if lengths.numel() else math.nan,
-    )

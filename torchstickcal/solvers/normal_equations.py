@@ -8,6 +8,7 @@ the reduced camera system is S = H_cc - W^T W.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -17,6 +18,7 @@ from torch import Tensor
 from torchstickcal import se3
 from torchstickcal.objective import Objective
 from torchstickcal.problem import State
+from torchstickcal.solvers.base import IterationRecord
 from torchstickcal.solvers.point_elimination import PointElimination, StickCoupling, outer
 from torchstickcal.solvers.track_elimination import TrackElimination
 
@@ -85,6 +87,27 @@ class NormalEquations:
         camera_diagonal = self.camera_hessian.diagonal(dim1=1, dim2=2)
         decrease += damping * float((camera_diagonal * camera_step**2).sum() + (diagonal * point_step**2).sum())
         return Step(camera_step, point_step, decrease)
+
+    def point_variance(self) -> Tensor:
+        """Mean variance along the axes of each point (N,), cameras known, stick ends taken singly, square metres."""
+        identity = torch.eye(3, dtype=self.points.dtype, device=self.points.device)
+        columns = identity[..., None].expand(3, 3, self.points.shape[1])
+        half = PointElimination(self.point_hessian, None).half_solve(columns)
+        return half.square().unflatten(1, (3, -1)).sum((0, 1)) / 3
+
+    def record(self, stage: str, iteration: int, damping: float, step_m: float) -> IterationRecord:
+        """The record of the iteration that ends here."""
+        lengths = self.objective.measurements.stick_lengths_m(self.points)
+        return IterationRecord(
+            stage=stage,
+            iteration=iteration,
+            cost=self.cost,
+            terms=self.terms,
+            damping=damping,
+            step_m=step_m,
+            reprojection_px=tuple(self.reprojection_px.tolist()),
+            stick_length_m=float(lengths.nanmean()) if lengths.numel() else math.nan,
+        )
 
     def reduced_system(self, damping: float = 0.0) -> tuple[Tensor, Tensor]:
         """The reduced camera system: S (6 C', 6 C') and its right-hand side's negative (6 C',)."""

@@ -52,14 +52,17 @@ class PointElimination:
             solved[:, :, self._sticks.ends] += (self._carry[None] * at_starts[:, :, None]).sum(1)
         return solved.flatten(1)
 
-    def solve(self, rhs: Tensor) -> Tensor:
-        """``H^-1 b`` of a right-hand side (3, N)."""
-        half = self.half_solve(rhs[None]).view_as(rhs)
+    def back_solve(self, half: Tensor) -> Tensor:
+        """``L^-T b`` of a right-hand side (3, N), differentiable by it."""
         if self._sticks is not None:
             starts, ends, _ = self._sticks
             at_ends = _backward(self._lower[:, ends], half[:, ends])
-            half[:, starts] += (self._coupling * at_ends[:, None]).sum(0)
+            half = half.index_add(1, starts, (self._coupling * at_ends[:, None]).sum(0))
         return _backward(self._lower, half)
+
+    def solve(self, rhs: Tensor) -> Tensor:
+        """``H^-1 b`` of a right-hand side (3, N)."""
+        return self.back_solve(self.half_solve(rhs[None]).view_as(rhs))
 
 
 def symmetric(entries: Tensor) -> Tensor:

@@ -1,0 +1,247 @@
+"""Configurations: what the calibration does, as data.
+
+A configuration is a TOML file. Those shipped with the package are found by name; a user's own may start from one of them
+with ``extends = "default"`` and state only what differs. ``false`` in place of a loss's table removes the loss.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import difflib
+import math
+import tomllib
+import types
+import typing
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from importlib import resources
+from pathlib import Path
+from typing import Any, Literal
+
+from torchstickcal.errors import ConfigError
+
+_EXTENDS = "extends"
+_UNIONS = (types.UnionType, typing.Union)
+
+
+@dataclass(frozen=True)
+class InitialiseSettings:
+    """How the first estimate is made.
+
+    Args:
+        min_common_points: fewest points, over all frames, that relate two cameras.
+        max_points: points of a pair that RANSAC looks at.
+        threshold_px: distance from the epipolar line up to which a point agrees with a pair.
+    """
+
+    min_common_points: int = 20
+    max_points: int = 200
+    threshold_px: float = 2.0
+
+
+@dataclass(frozen=True)
+class ScaleSettings:
+    """A length that sets the scale where no stick does: from the mean of some named points to the mean of others.
+
+    Args:
+        start: names of the points at one end.
+        end: names of the points at the other end.
+        length_m: the mean length over the session, metres.
+    """
+
+    start: list[str]
+    end: list[str]
+    length_m: float
+
+
+@dataclass(frozen=True)
+class ReprojectionSettings:
+    """The reprojection loss; ``sigma_px = "estimated"`` takes the noise of each point from the data."""
+
+    sigma_px: float | Literal["estimated"] = "estimated"
+    kernel: Literal["none", "cauchy", "huber", "geman_mcclure"] = "none"
+    kernel_scale: float | None = None
+    weight: float = 1.0
+
+
+@dataclass(frozen=True)
+class StickLengthSettings:
+    """The stick-length loss; ``sigma_m`` is how well the length is known."""
+
+    sigma_m: float = 0.001
+    weight: float = 1.0
+
+
+@dataclass(frozen=True)
+class SmoothnessSettings:
+    """The smoothness loss; ``sigma_m`` is the standard deviation of a second difference over frames."""
+
+    sigma_m: float | Literal["estimated"] = "estimated"
+    weight: float = 1.0
+
+
+@dataclass(frozen=True)
+class Stage:
+    """One minimisation.
+
+    Args:
+        cameras: whether the cameras are adjusted or held where they are.
+        reprojection, stick_length, smoothness: the losses; None for those that take no part.
+        rescale: whether the scene is brought to scale in closed form afterwards.
+        max_iterations: limit of iterations.
+        cost_tolerance: relative decrease of the cost at which the stage has converged.
+    """
+
+    cameras: Literal["free", "held"] = "free"
+    reprojection: ReprojectionSettings = field(default_factory=ReprojectionSettings)
+    stick_length: StickLengthSettings | None = None
+    smoothness: SmoothnessSettings | None = None
+    rescale: bool = False
+    max_iterations: int = 100
+    cost_tolerance: float = 1e-9
+
+
+@dataclass(frozen=True)
+class Config:
+    """A whole calibration.
+
+    Args:
+        stages: the minimisations, in order, by name.
+        points: which points take part: all, only stick ends, or only joints.
+        solver: which solver minimises.
+        initialise: the first estimate.
+        scale: a length between points, where the scale shall not come from the sticks.
+    """
+
+    stages: dict[str, Stage]
+    points: Literal["all", "sticks", "joints"] = "all"
+    solver: Literal["gauss_newton", "lbfgs"] = "gauss_newton"
+    initialise: InitialiseSettings = field(default_factory=InitialiseSettings)
+    scale: ScaleSettings | None = None
+
+
+def config_names() -> list[str]:
+    """The names of the configurations shipped with the package."""
+    files = resources.files("torchstickcal.configs").iterdir()
+    return sorted(Path(file.name).stem for file in files if file.name.endswith(".toml"))
+
+
+def load_config(config: str | Path | Mapping[str, Any] | Config = "default") -> Config:
+    """A configuration from its name, from a TOML file, from a mapping of the same keys, or as it is.
+
+    Raises:
+        ConfigError: for an unknown name, an unknown key (with the nearest known one), or an unusable value.
+    """
+    if isinstance(config, Config):
+        return config
+    if isinstance(config, Mapping):
+        return _build(Config, _extended(dict(config), "mapping"), "mapping", ())
+    return _build(Config, _read(config), str(config), ())
+
+
+def _read(config: str | Path) -> dict[str, Any]:
+    """The keys of a named configuration or a file, with what it extends filled in."""
+    names = config_names()
+    if str(config) in names:
+        text = (resources.files("torchstickcal.configs") / f"{config}.toml").read_text("utf-8")
+    elif Path(config).is_file():
+        text = Path(config).read_text("utf-8")
+    else:
+        raise ConfigError(
+            "unknown configuration",
+            where="config",
+            got=repr(str(config)),
+            expected=f"a TOML file or one of {', '.join(names)}",
+            remedy=_suggestion(str(config), names),
+        )
+    try:
+        keys = tomllib.loads(text)
+    except tomllib.TOMLDecodeError as error:
+        raise ConfigError("a configuration is not TOML", where=str(config), got=str(error), expected="TOML") from error
+    return _extended(keys, str(config))
+
+
+def _extended(keys: dict[str, Any], where: str) -> dict[str, Any]:
+    base = keys.pop(_EXTENDS, None)
+    if base is None:
+        return keys
+    if not isinstance(base, str):
+        raise ConfigError("unusable value", where=f"{where}: {_EXTENDS}", got=repr(base), expected="a configuration's name")
+    return _merged(_read(base), keys)
+
+
+def _merged(base: dict[str, Any], changes: dict[str, Any]) -> dict[str, Any]:
+    merged = dict(base)
+    for key, value in changes.items():
+        nested = isinstance(value, dict) and isinstance(base.get(key), dict)
+        merged[key] = _merged(base[key], value) if nested else value
+    return merged
+
+
+def _build(kind: Any, value: Any, where: str, path: tuple[str, ...]) -> Any:
+    """A value of a type built from TOML, or a ConfigError that names the key."""
+    if dataclasses.is_dataclass(kind):
+        return _build_dataclass(typing.cast(type, kind), value, where, path)
+    origin, arguments = typing.get_origin(kind), typing.get_args(kind)
+    if origin in _UNIONS:
+        if value is False and type(None) in arguments:
+            return None
+        options = [option for option in arguments if option is not type(None)]
+        matching = [option for option in options if _fits(option, value)]
+        if matching or len(options) == 1:
+            return _build((matching or options)[0], value, where, path)
+    elif origin is dict and isinstance(value, dict):
+        return {key: _build(arguments[1], item, where, (*path, key)) for key, item in value.items()}
+    elif origin is list and isinstance(value, list):
+        return [_build(arguments[0], item, where, (*path, str(number))) for number, item in enumerate(value)]
+    elif _fits(kind, value):
+        return float(value) if kind is float else value
+    raise ConfigError(
+        "unusable value", where=f"{where}: {'.'.join(path) or 'top level'}", got=repr(value), expected=_description(kind)
+    )
+
+
+def _build_dataclass(kind: type, value: Any, where: str, path: tuple[str, ...]) -> Any:
+    if not isinstance(value, dict):
+        raise ConfigError("unusable value", where=f"{where}: {'.'.join(path)}", got=repr(value), expected="a table")
+    hints = typing.get_type_hints(kind)
+    for key in value:
+        if key not in hints:
+            raise ConfigError(
+                "unknown key",
+                where=f"{where}: {'.'.join((*path, key))}",
+                got=repr(key),
+                expected=f"one of {', '.join(hints)}",
+                remedy=_suggestion(key, hints),
+            )
+    required = [f.name for f in dataclasses.fields(kind) if f.default is f.default_factory is dataclasses.MISSING]
+    missing = [name for name in required if name not in value]
+    if missing:
+        table = ".".join(path) or "top level"
+        raise ConfigError("missing key", where=f"{where}: {table}", got=", ".join(value) or "nothing", expected=missing[0])
+    return kind(**{key: _build(hints[key], item, where, (*path, key)) for key, item in value.items()})
+
+
+def _fits(kind: Any, value: Any) -> bool:
+    if typing.get_origin(kind) is Literal:
+        return isinstance(value, str) and value in typing.get_args(kind)
+    if kind is float:
+        return isinstance(value, int | float) and not isinstance(value, bool) and 0 < value < math.inf
+    if kind is int:
+        return isinstance(value, int) and not isinstance(value, bool) and value > 0
+    return isinstance(kind, type) and isinstance(value, kind)
+
+
+def _description(kind: Any) -> str:
+    if typing.get_origin(kind) is Literal:
+        return " or ".join(repr(option) for option in typing.get_args(kind))
+    if typing.get_origin(kind) in _UNIONS:
+        return " or ".join("false" if option is type(None) else _description(option) for option in typing.get_args(kind))
+    if dataclasses.is_dataclass(kind):
+        return "a table"
+    return {float: "a number above 0", int: "a whole number above 0", bool: "true or false", str: "a text"}.get(kind, str(kind))
+
+
+def _suggestion(key: str, known: typing.Iterable[str]) -> str:
+    near = difflib.get_close_matches(key, list(known), n=1)
+    return f"Did you mean {near[0]!r}?" if near else ""

@@ -1,0 +1,87 @@
+"""How noisy the keypoints and how unsteady the tracks are, estimated from the data themselves."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor
+
+from torchstickcal.problem import Measurements, State
+
+_CUT = 3.0
+_ROUNDS = 5
+_MEDIAN_CHI2_2 = 2 * math.log(2)
+_MIN_SIGMA_PX = 1e-3
+_MIN_ACCELERATION_M = 1e-5
+
+
+def estimate_sigma_px(measurements: Measurements, state: State) -> Tensor:
+    """Standard deviation of a keypoint along each axis, (P,), pixels, for every point of the skeleton and the sticks.
+
+    From the residuals of the adjustment: their second moment inside a cut of 3 standard deviations, corrected for the part
+    cut off and for the three degrees of freedom each 3D point has taken. Estimates of single points are drawn towards
+    their common value as far as their spread is explained by chance (an empirical-Bayes mean of log variances), so that
+    points that are alike are treated alike.
+    """
+    squared = measurements.by_frame(_squared_residuals(measurements, state) * measurements.confidence)
+    visible = measurements.by_frame(measurements.visible)
+    variance = _first_guess(squared, visible)
+    for _ in range(_ROUNDS):
+        kept = visible & (squared <= _CUT**2 * variance)
+        views = kept.sum(0)
+        kept = kept & (views >= 2)
+        freedom = (2 * kept.sum(0) - 3).clamp_min(0).sum(0).to(squared)
+        variance = (squared * kept).sum((0, 1)) / freedom.clamp_min(1) / _truncated_moment(_CUT)
+        variance = _draw_together(variance.clamp_min(_MIN_SIGMA_PX**2), freedom)
+    return variance.sqrt()
+
+
+def estimate_acceleration_m(measurements: Measurements, points: Tensor, point_covariance: Tensor) -> Tensor:
+    """Standard deviation of a second difference along each axis, (P,), metres, of each point's true motion.
+
+    Args:
+        measurements: the session.
+        points: (3, N).
+        point_covariance: mean variance along the axes of each point as triangulated, (N,), square metres.
+    """
+    active = measurements.by_frame(measurements.active)
+    complete = active[2:] & active[1:-1] & active[:-2]
+    x, noise = measurements.by_frame(points), measurements.by_frame(point_covariance)
+    measured = (x[:, 2:] - 2 * x[:, 1:-1] + x[:, :-2]).square().mean(0)
+    expected = noise[2:] + 4 * noise[1:-1] + noise[:-2]
+    weights = complete / expected.clamp_min(_MIN_ACCELERATION_M**2)
+    variance = ((measured - expected) * weights).sum(0) / weights.sum(0).clamp_min(1e-300)
+    return variance.clamp_min(_MIN_ACCELERATION_M**2).sqrt()
+
+
+def _squared_residuals(measurements: Measurements, state: State) -> Tensor:
+    x, y = measurements.cameras.project_components(*state.in_cameras().unbind(1))
+    return (x - measurements.pixels[:, 0]).square() + (y - measurements.pixels[:, 1]).square()
+
+
+def _first_guess(squared: Tensor, visible: Tensor) -> Tensor:
+    """Variance (P,) by the median of the squared residuals, each enlarged by the share its point has absorbed."""
+    views = visible.sum(0)
+    enlarged = squared * (2 * views / (2 * views - 3).clamp_min(1))
+    median = enlarged.where(visible, torch.nan).flatten(0, 1).nanmedian(0).values
+    overall = enlarged[visible].median() if visible.any() else squared.new_ones(())
+    return (median.where(median.isfinite(), overall) / _MEDIAN_CHI2_2).clamp_min(_MIN_SIGMA_PX**2)
+
+
+def _truncated_moment(cut: float) -> float:
+    """Second moment of a two-dimensional Gaussian inside a radius of ``cut`` sigma, as a share of the whole."""
+    tail = math.exp(-(cut**2) / 2)
+    return 1 - (cut**2 / 2) * tail / (1 - tail)
+
+
+def _draw_together(variance: Tensor, freedom: Tensor) -> Tensor:
+    """Shrink log variances (P,) with given degrees of freedom (P,) towards their mean."""
+    chance = 2 / freedom.clamp_min(0.1)
+    logs = variance.log()
+    weights = chance.reciprocal() * (freedom > 0)
+    mean = (logs * weights).sum() / weights.sum().clamp_min(1e-300)
+    excess = (weights * ((logs - mean).square() - chance)).sum() / weights.sum().clamp_min(1e-300)
+    spread = excess.clamp_min(0.0)
+    mean = (logs / (spread + chance)).sum() / (1 / (spread + chance)).sum()
+    return (mean + (logs - mean) * spread / (spread + chance)).exp()

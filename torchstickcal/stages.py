@@ -1,0 +1,128 @@
+"""Running one stage: its losses with their noise, its solver, and the closed-form scale."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from torchstickcal.config import Config, Stage
+from torchstickcal.errors import ConfigError
+from torchstickcal.losses import Loss, ReprojectionLoss, SmoothnessLoss, StickLengthLoss, robust_kernel
+from torchstickcal.noise import estimate_acceleration_m, estimate_sigma_px
+from torchstickcal.objective import Objective
+from torchstickcal.observations import Observations
+from torchstickcal.problem import Measurements, State
+from torchstickcal.solvers import IterationRecord, Listener, Stop, Termination, solver
+from torchstickcal.solvers.normal_equations import linearise
+
+_OUTLIER_CUT = 3.5
+_MAD_TO_SIGMA = 1.4826
+
+
+@dataclass(frozen=True)
+class StageRecord:
+    """What happened in one stage."""
+
+    name: str
+    stop: Stop
+    seconds: float
+    iterations: tuple[IterationRecord, ...]
+
+
+@dataclass(frozen=True)
+class Ruler:
+    """A known length: the mean distance over the session between the means of two groups of points."""
+
+    start: tuple[int, ...]
+    end: tuple[int, ...]
+    length_m: float
+
+    def lengths_m(self, measurements: Measurements, points: Tensor) -> Tensor:
+        """Its length in the frames (K,) in which all its points are known, of points (3, N)."""
+        by_frame, active = measurements.by_frame(points), measurements.by_frame(measurements.active)
+        start, end = list(self.start), list(self.end)
+        known = active[:, start + end].all(1)
+        vectors = by_frame[:, known][..., end].mean(-1) - by_frame[:, known][..., start].mean(-1)
+        return vectors.square().sum(0).sqrt()
+
+
+def rulers(observations: Observations, config: Config) -> list[Ruler]:
+    """Where the scale comes from: the configuration's segment, else the sticks.
+
+    Raises:
+        ConfigError: if there is neither.
+        ObservationError: if the segment names a point the session does not have.
+    """
+    if config.scale is not None:
+        start, end = (tuple(map(observations.point_index, names)) for names in (config.scale.start, config.scale.end))
+        return [Ruler(start, end, config.scale.length_m)]
+    if observations.sticks and config.points != "joints":
+        return [Ruler((stick.start,), (stick.end,), stick.length_m) for stick in observations.sticks]
+    raise ConfigError(
+        "nothing sets the scale",
+        where="scale",
+        got=f"{len(observations.sticks)} sticks, points = {config.points!r}",
+        expected="a stick among the points that take part, or a [scale] table with a known length",
+    )
+
+
+def scale_factor(measurements: Measurements, points: Tensor, known: Sequence[Ruler]) -> float:
+    """The paper's stage 2: known over mean reconstructed length, frames far from the median left out."""
+    measured, expected = 0.0, 0.0
+    for ruler in known:
+        lengths = ruler.lengths_m(measurements, points)
+        deviation = (lengths - lengths.median()).abs()
+        kept = lengths[deviation <= _OUTLIER_CUT * _MAD_TO_SIGMA * deviation.median() + 1e-12 * lengths.median()]
+        measured += float(kept.sum())
+        expected += ruler.length_m * len(kept)
+    return expected / measured
+
+
+def run_stage(
+    name: str,
+    stage: Stage,
+    measurements: Measurements,
+    state: State,
+    known: Sequence[Ruler],
+    solver_name: str,
+    listener: Listener,
+) -> tuple[State, StageRecord]:
+    """Run one stage from a state."""
+    began = time.perf_counter()
+    sigma_px = estimate_sigma_px(measurements, state)
+    objective = Objective(measurements, _losses(stage, measurements, state, sigma_px))
+    outcome = solver(solver_name)(
+        objective,
+        state,
+        cameras_free=stage.cameras == "free",
+        termination=Termination(stage.max_iterations, stage.cost_tolerance),
+        stage=name,
+        listener=listener,
+    )
+    state = outcome.state
+    if stage.rescale:
+        state = state.scaled(scale_factor(measurements, state.points, known))
+    return state, StageRecord(name, outcome.stop, time.perf_counter() - began, outcome.iterations)
+
+
+def _losses(stage: Stage, measurements: Measurements, state: State, sigma_px: Tensor) -> dict[str, Loss]:
+    settings = stage.reprojection
+    reprojection = ReprojectionLoss(
+        sigma_px if settings.sigma_px == "estimated" else settings.sigma_px,
+        settings.weight,
+        robust_kernel(settings.kernel, settings.kernel_scale),
+    )
+    losses: dict[str, Loss] = {"reprojection": reprojection}
+    if stage.stick_length is not None:
+        losses["stick_length"] = StickLengthLoss(stage.stick_length.sigma_m, stage.stick_length.weight)
+    if stage.smoothness is not None:
+        sigma_m = stage.smoothness.sigma_m
+        if sigma_m == "estimated":
+            system = linearise(Objective(measurements, dict(losses)), state, cameras_free=False)
+            sigma_m = estimate_acceleration_m(measurements, state.points, system.point_variance())
+        losses["smoothness"] = SmoothnessLoss(sigma_m, stage.smoothness.weight)
+    return losses
