@@ -68,7 +68,7 @@ class Huber:
 class GemanMcClure:
     """rho(s) = s / (1 + s / c^2): bounded by c^2, so a gross outlier has no pull."""
 
-    scale: float = 6.0
+    scale: float = 8.0
 
     def rho(self, squared: Tensor) -> Tensor:
         return squared / (1 + squared / self.scale**2)

@@ -9,17 +9,18 @@ from torch import Tensor
 
 from torchstickcal.problem import Measurements, State
 
-_CUT = 3.0
+_CUT = 4.0
 _ROUNDS = 5
 _MEDIAN_CHI2_2 = 2 * math.log(2)
 _MIN_SIGMA_PX = 1e-3
 _MIN_ACCELERATION_M = 1e-5
+_DISCERNIBLE_SHARE = 0.01
 
 
 def estimate_sigma_px(measurements: Measurements, state: State) -> Tensor:
     """Standard deviation of a keypoint along each axis, (P,), pixels, for every point of the skeleton and the sticks.
 
-    From the residuals of the adjustment: their second moment inside a cut of 3 standard deviations, corrected for the part
+    From the residuals of the adjustment: their second moment inside a cut of 4 standard deviations, corrected for the part
     cut off and for the three degrees of freedom each 3D point has taken. Estimates of single points are drawn towards
     their common value as far as their spread is explained by chance (an empirical-Bayes mean of log variances), so that
     points that are alike are treated alike.
@@ -40,6 +41,9 @@ def estimate_sigma_px(measurements: Measurements, state: State) -> Tensor:
 def estimate_acceleration_m(measurements: Measurements, points: Tensor, point_covariance: Tensor) -> Tensor:
     """Standard deviation of a second difference along each axis, (P,), metres, of each point's true motion.
 
+    What the measured second differences have beyond the noise of triangulation; never less than a small share of that
+    noise, below which a motion cannot be told from none.
+
     Args:
         measurements: the session.
         points: (3, N).
@@ -51,8 +55,10 @@ def estimate_acceleration_m(measurements: Measurements, points: Tensor, point_co
     measured = (x[:, 2:] - 2 * x[:, 1:-1] + x[:, :-2]).square().mean(0)
     expected = noise[2:] + 4 * noise[1:-1] + noise[:-2]
     weights = complete / expected.clamp_min(_MIN_ACCELERATION_M**2)
-    variance = ((measured - expected) * weights).sum(0) / weights.sum(0).clamp_min(1e-300)
-    return variance.clamp_min(_MIN_ACCELERATION_M**2).sqrt()
+    total = weights.sum(0).clamp_min(1e-300)
+    variance = ((measured - expected) * weights).sum(0) / total
+    discernible = _DISCERNIBLE_SHARE * complete.sum(0) / total
+    return torch.maximum(variance, discernible).clamp_min(_MIN_ACCELERATION_M**2).sqrt()
 
 
 def _squared_residuals(measurements: Measurements, state: State) -> Tensor:

@@ -1,6 +1,6 @@
 """torch.optim.LBFGS on the same objective, through autograd.
 
-The unknowns are scaled by Cholesky factors of the Gauss-Newton system at the start, of each point's block and of the reduced
+The unknowns are scaled by Cholesky factors of the Gauss-Newton system, of each point's block and of the reduced
 camera system, so that a unit of each changes the cost by about the same: without it the method needs thousands of iterations.
 """
 
@@ -13,19 +13,17 @@ from torchstickcal.extrinsics import Extrinsics
 from torchstickcal.objective import Objective
 from torchstickcal.problem import State
 from torchstickcal.solvers.base import IterationRecord, Listener, Outcome, Stop, Termination
-from torchstickcal.solvers.normal_equations import linearise
+from torchstickcal.solvers.normal_equations import NormalEquations, linearise
 from torchstickcal.solvers.point_elimination import PointElimination
 
-_HISTORY = 30
-_ITERATIONS_A_ROUND = 10
+_ITERATIONS_A_ROUND = 100
 _DAMPING = 1e-6
 
 
 class _ScaledUnknowns:
     """Poses and points as functions of well-scaled unknowns that are zero at the start."""
 
-    def __init__(self, objective: Objective, start: State, cameras_free: bool) -> None:
-        system = linearise(objective, start, cameras_free)
+    def __init__(self, system: NormalEquations, start: State) -> None:
         hessian = system.point_hessian.clone()
         hessian[[0, 3, 5]] *= 1 + _DAMPING
         self._points = PointElimination(hessian, None)
@@ -58,13 +56,34 @@ def lbfgs(
 ) -> Outcome:
     """Minimise an objective over the points and, unless held, all cameras but the first.
 
-    A record stands for a round of ten iterations, and ``termination.max_iterations`` counts rounds.
+    It runs in rounds, each with fresh scales and a fresh history; a record stands for a round, and the limit of iterations
+    counts rounds.
     """
-    unknowns = _ScaledUnknowns(objective, state, cameras_free)
+    stop, step_m = Stop.ITERATIONS, 0.0
+    records: list[IterationRecord] = []
+    for iteration in range(termination.max_iterations + 1):
+        system = linearise(objective, state, cameras_free)
+        records.append(system.record(stage, iteration, damping=0.0, step_m=step_m))
+        listener(records[-1])
+        if iteration and records[-2].cost - records[-1].cost <= termination.cost_tolerance * records[-1].cost:
+            stop = Stop.COST
+            break
+        if iteration == termination.max_iterations:
+            break
+        moved = _round(objective, _ScaledUnknowns(system, state))
+        if not bool(moved.points.isfinite().all()):
+            stop = Stop.DIVERGED
+            break
+        step_m = float((moved.points - state.points).abs().max())
+        state = moved
+    return Outcome(state, stop, tuple(records))
+
+
+def _round(objective: Objective, unknowns: _ScaledUnknowns) -> State:
     optimiser = torch.optim.LBFGS(
         [unknowns.camera, unknowns.point],
         max_iter=_ITERATIONS_A_ROUND,
-        history_size=_HISTORY,
+        history_size=_ITERATIONS_A_ROUND,
         line_search_fn="strong_wolfe",
         tolerance_grad=0.0,
         tolerance_change=0.0,
@@ -72,30 +91,12 @@ def lbfgs(
 
     def closure() -> Tensor:
         optimiser.zero_grad()
-        current = unknowns.state()
-        points = objective.measurements.by_frame(current.points).movedim(0, -1)
-        cost = torch.stack(list(objective.terms(current.rotations, current.translations, points).values())).sum()
+        state = unknowns.state()
+        points = objective.measurements.by_frame(state.points).movedim(0, -1)
+        cost = torch.stack(list(objective.terms(state.rotations, state.translations, points).values())).sum()
         cost.backward()
         return cost
 
-    stop, step_m = Stop.ITERATIONS, 0.0
-    records: list[IterationRecord] = []
-    for iteration in range(termination.max_iterations + 1):
-        system = linearise(objective, state, cameras_free)
-        records.append(system.record(stage, iteration, damping=0.0, step_m=step_m))
-        listener(records[-1])
-        if iteration:
-            decrease = records[-2].cost - records[-1].cost
-            if decrease <= termination.cost_tolerance * records[-1].cost:
-                stop = Stop.COST
-                break
-        if iteration < termination.max_iterations:
-            optimiser.step(closure)  # pyright: ignore[reportArgumentType]
-            with torch.no_grad():
-                moved = unknowns.state()
-            step_m = float((moved.points - state.points).abs().max())
-            if not bool(moved.points.isfinite().all()):
-                stop = Stop.DIVERGED
-                break
-            state = moved
-    return Outcome(state, stop, tuple(records))
+    optimiser.step(closure)  # pyright: ignore[reportArgumentType]
+    with torch.no_grad():
+        return unknowns.state()
