@@ -21,6 +21,9 @@ from torchstickcal.solvers import IterationRecord
 from torchstickcal.stages import StageRecord, rulers, run_stage
 
 
+_USELESS_FOCAL_SHARE = 0.03
+
+
 class Callback(Protocol):
     """What may listen to a calibration: a progress bar, TensorBoard, a test."""
 
@@ -62,15 +65,15 @@ def calibrate(
     state = initialise(measurements, settings.initialise, labels)
     seconds = {"initialise": time.perf_counter() - began}
 
-    stages: list[StageRecord] = []
+    used, stages = measurements, list[StageRecord]()
     for name, stage in settings.stages.items():
         listener = callback.on_iteration if callback else _ignore
-        state, record = run_stage(name, stage, measurements, state, known, settings.solver, listener)
+        state, used, record = run_stage(name, stage, measurements, state, known, settings.solver, listener)
         stages.append(record)
         seconds[name] = record.seconds
     seconds["total"] = time.perf_counter() - began
 
-    calibration = _result(observations, measurements, state, stages, seconds, labels)
+    calibration = _result(observations, measurements, used, state, stages, seconds, labels)
     if callback:
         callback.on_end(calibration)
     return calibration
@@ -89,20 +92,22 @@ def _points_used(observations: Observations, config: Config) -> list[int] | None
 def _result(
     observations: Observations,
     measurements: Measurements,
+    used: Measurements,
     state: State,
     stages: list[StageRecord],
     seconds: dict[str, float],
     labels: list[str],
 ) -> Calibration:
-    points = measurements.by_frame(state.points.where(measurements.active, torch.nan)).movedim(0, -1)
-    counted = measurements.by_frame(measurements.visible)[..., None]
+    points = used.by_frame(state.points.where(used.active, torch.nan)).movedim(0, -1)
+    compared = (observations.visible & points.isfinite().all(-1))[..., None]
     residuals = reprojection_residuals(
         points, state.rotations, state.translations, observations.keypoints.double(), measurements.cameras
-    ).where(counted, torch.nan)
+    ).where(compared, torch.nan)
 
     def as_given(tensor: Tensor) -> Tensor:
         return tensor.to(observations.keypoints.dtype).contiguous()
 
+    sigma_px = estimate_sigma_px(measurements, state)
     distortion, size = observations.distortion, observations.image_size
     cameras = observations.num_cameras
     return Calibration(
@@ -110,8 +115,9 @@ def _result(
         translations=as_given(state.translations),
         points=as_given(points),
         residuals_px=as_given(residuals),
+        inliers=used.by_frame(used.visible),
         stick_lengths_m=as_given(_stick_lengths(observations, points)),
-        sigma_px=as_given(estimate_sigma_px(measurements, state)),
+        sigma_px=as_given(sigma_px),
         intrinsics=as_given(observations.cameras.matrix),
         distortion=None if distortion is None else as_given(distortion.expand(cameras, distortion.shape[-1])),
         image_size=None if size is None else size.expand(cameras, 2).round().long().contiguous(),
@@ -122,7 +128,7 @@ def _result(
         camera_names=tuple(labels),
         stages=tuple(stages),
         seconds=seconds,
-        warnings=_warnings(observations, measurements),
+        warnings=_warnings(observations, measurements, used, sigma_px),
     )
 
 
@@ -132,11 +138,19 @@ def _stick_lengths(observations: Observations, points: Tensor) -> Tensor:
     return (points[:, ends] - points[:, starts]).square().sum(-1).sqrt()
 
 
-def _warnings(observations: Observations, measurements: Measurements) -> tuple[str, ...]:
+def _warnings(observations: Observations, measurements: Measurements, used: Measurements, sigma_px: Tensor) -> tuple[str, ...]:
     found: list[str] = []
-    alone = int((observations.visible & ~measurements.by_frame(measurements.visible)).sum())
+    seen, comparable = measurements.by_frame(observations.visible.flatten(1)), measurements.by_frame(measurements.visible)
+    total, alone = int(comparable.sum()), int((seen & ~comparable).sum())
+    outliers = total - int(used.visible.sum())
     if alone:
-        found.append(f"{alone} of {int(observations.visible.sum())} keypoints took no part: no second camera saw the point.")
+        found.append(f"{alone} of {int(seen.sum())} keypoints took no part: no second camera saw the point, or it was not asked for.")
+    if outliers:
+        found.append(f"{outliers} of {total} keypoints ({outliers / total:.1%}) contradict the rest and were set aside.")
+    blurred = (sigma_px > _USELESS_FOCAL_SHARE * measurements.cameras.focal_px.mean()).nonzero().flatten().tolist()
+    if blurred:
+        names = ", ".join(observations.point_label(point) for point in blurred)
+        found.append(f"too noisy to be of use (their 3D points are not reliable): {names}.")
     return tuple(found)
 
 

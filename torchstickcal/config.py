@@ -87,6 +87,8 @@ class Stage:
     Args:
         cameras: whether the cameras are adjusted or held where they are.
         reprojection, stick_length, smoothness: the losses; None for those that take no part.
+        reject_sigmas: residual, in standard deviations, beyond which a keypoint is set aside before the stage begins; None
+            to keep all.
         rescale: whether the scene is brought to scale in closed form afterwards.
         max_iterations: limit of iterations.
         cost_tolerance: relative decrease of the cost at which the stage has converged.
@@ -96,6 +98,7 @@ class Stage:
     reprojection: ReprojectionSettings = field(default_factory=ReprojectionSettings)
     stick_length: StickLengthSettings | None = None
     smoothness: SmoothnessSettings | None = None
+    reject_sigmas: float | None = None
     rescale: bool = False
     max_iterations: int = 100
     cost_tolerance: float = 1e-9

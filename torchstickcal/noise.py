@@ -25,7 +25,7 @@ def estimate_sigma_px(measurements: Measurements, state: State) -> Tensor:
     their common value as far as their spread is explained by chance (an empirical-Bayes mean of log variances), so that
     points that are alike are treated alike.
     """
-    squared = measurements.by_frame(_squared_residuals(measurements, state) * measurements.confidence)
+    squared = measurements.by_frame(measurements.squared_residuals(state) * measurements.confidence)
     visible = measurements.by_frame(measurements.visible)
     variance = _first_guess(squared, visible)
     for _ in range(_ROUNDS):
@@ -59,11 +59,6 @@ def estimate_acceleration_m(measurements: Measurements, points: Tensor, point_co
     variance = ((measured - expected) * weights).sum(0) / total
     discernible = _DISCERNIBLE_SHARE * complete.sum(0) / total
     return torch.maximum(variance, discernible).clamp_min(_MIN_ACCELERATION_M**2).sqrt()
-
-
-def _squared_residuals(measurements: Measurements, state: State) -> Tensor:
-    x, y = measurements.cameras.project_components(*state.in_cameras().unbind(1))
-    return (x - measurements.pixels[:, 0]).square() + (y - measurements.pixels[:, 1]).square()
 
 
 def _first_guess(squared: Tensor, visible: Tensor) -> Tensor:

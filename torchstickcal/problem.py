@@ -60,6 +60,16 @@ class Measurements:
             lengths_m=torch.tensor([s.length_m for s in sticks], dtype=torch.float64).to(keypoints.device),
         )
 
+    def keeping(self, kept: Tensor) -> Measurements:
+        """The measurements without the keypoints outside a mask (C, N), and without points left with a single view."""
+        confidence = self.confidence * kept
+        return replace(self, confidence=confidence * ((confidence > 0).sum(0) >= 2))
+
+    def squared_residuals(self, state: State) -> Tensor:
+        """Squared distances (C, N) between projections and keypoints, square pixels; meaningless where not seen."""
+        x, y = self.cameras.project_components(*state.in_cameras().unbind(1))
+        return (x - self.pixels[:, 0]).square() + (y - self.pixels[:, 1]).square()
+
     @property
     def visible(self) -> Tensor:
         """(C, N), True where a keypoint counts."""

@@ -22,7 +22,7 @@ from torchstickcal.stages import StageRecord
 
 _FORMAT = "torchstickcal calibration 1"
 _TENSORS = (
-    "rotations", "translations", "points", "residuals_px", "stick_lengths_m", "sigma_px", "intrinsics", "distortion", "image_size",
+    "rotations", "translations", "points", "residuals_px", "inliers", "stick_lengths_m", "sigma_px", "intrinsics", "distortion", "image_size",
 )  # fmt: skip
 
 
@@ -40,7 +40,9 @@ class Calibration:
     points: Tensor
     """(F, P, 3), metres; NaN where fewer than two cameras saw the point"""
     residuals_px: Tensor
-    """(C, F, P, 2), projection minus keypoint, pixels; NaN where not seen or not reconstructed"""
+    """(C, F, P, 2), projection minus keypoint, pixels, of inliers and outliers; NaN where not seen or the point not known"""
+    inliers: Tensor
+    """(C, F, P), True where a keypoint took part to the end: seen by a second camera too, and agreeing with the others"""
     stick_lengths_m: Tensor
     """(F, S), reconstructed lengths; NaN where an end is not known"""
     sigma_px: Tensor
@@ -85,13 +87,16 @@ class Calibration:
 
     @property
     def reprojection_rms_px(self) -> Tensor:
-        """(C,), root mean square over the keypoints of each camera of the residuals' lengths, pixels."""
-        return self.residuals_px.square().sum(-1).flatten(1).nanmean(1).sqrt()
+        """(C,), root mean square over the inliers of each camera of the residuals' lengths, pixels."""
+        return self._inlier_distances().square().nanmean(1).sqrt()
 
     @property
     def reprojection_median_px(self) -> Tensor:
-        """(C,), median over the keypoints of each camera of the residuals' lengths, pixels."""
-        return self.residuals_px.square().sum(-1).sqrt().flatten(1).nanmedian(1).values
+        """(C,), median over the inliers of each camera of the residuals' lengths, pixels."""
+        return self._inlier_distances().nanmedian(1).values
+
+    def _inlier_distances(self) -> Tensor:
+        return self.residuals_px.norm(dim=-1).where(self.inliers, torch.nan).flatten(1)
 
     def save(self, path: str | Path) -> None:
         """Write everything to one ``.npz`` file."""

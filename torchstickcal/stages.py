@@ -90,10 +90,12 @@ def run_stage(
     known: Sequence[Ruler],
     solver_name: str,
     listener: Listener,
-) -> tuple[State, StageRecord]:
-    """Run one stage from a state."""
+) -> tuple[State, Measurements, StageRecord]:
+    """Run one stage from a state; returns the new state, the measurements that took part and the record."""
     began = time.perf_counter()
     sigma_px = estimate_sigma_px(measurements, state)
+    if stage.reject_sigmas is not None:
+        measurements = measurements.keeping(_agreeing(measurements, state, stage.reject_sigmas * sigma_px))
     objective = Objective(measurements, _losses(stage, measurements, state, sigma_px))
     outcome = solver(solver_name)(
         objective,
@@ -106,7 +108,13 @@ def run_stage(
     state = outcome.state
     if stage.rescale:
         state = state.scaled(scale_factor(measurements, state.points, known))
-    return state, StageRecord(name, outcome.stop, time.perf_counter() - began, outcome.iterations)
+    return state, measurements, StageRecord(name, outcome.stop, time.perf_counter() - began, outcome.iterations)
+
+
+def _agreeing(measurements: Measurements, state: State, limit_px: Tensor) -> Tensor:
+    """(C, N), True where a keypoint lies within a limit (P,) of its point's projection, in front of the camera."""
+    squared = measurements.by_frame(measurements.squared_residuals(state) * measurements.confidence)
+    return (squared <= limit_px.square()).flatten(1) & (state.in_cameras()[:, 2] > 0)
 
 
 def _losses(stage: Stage, measurements: Measurements, state: State, sigma_px: Tensor) -> dict[str, Loss]:

@@ -15,7 +15,7 @@ class Stop(StrEnum):
     """Why a solver stopped; the value is the sentence to show."""
 
     COST = "converged: the cost no longer falls"
-    STEP = "converged: the step is negligible"
+    CAMERAS = "converged: the cameras no longer move"
     EXACT = "converged: the residuals are at rounding"
     ITERATIONS = "stopped at the limit of iterations"
     DIVERGED = "stopped: no step lowers the cost"
@@ -23,7 +23,7 @@ class Stop(StrEnum):
     @property
     def converged(self) -> bool:
         """Whether the state is a minimum to the tolerance asked for."""
-        return self in {Stop.COST, Stop.STEP, Stop.EXACT}
+        return self in {Stop.COST, Stop.CAMERAS, Stop.EXACT}
 
 
 @dataclass(frozen=True)
@@ -33,12 +33,13 @@ class Termination:
     Args:
         max_iterations: limit of iterations, each one evaluation of the derivatives.
         cost_tolerance: relative decrease of the cost, promised or reached, below which it has converged.
-        step_tolerance_m: largest movement of a camera or point below which it has converged, metres.
+        camera_tolerance: step of the cameras below which it has converged, in standard deviations of their estimate. It
+            ends a run in which nothing moves any more but single points that outliers leave undetermined.
     """
 
     max_iterations: int = 100
     cost_tolerance: float = 1e-9
-    step_tolerance_m: float = 1e-12
+    camera_tolerance: float = 1e-5
 
 
 @dataclass(frozen=True)

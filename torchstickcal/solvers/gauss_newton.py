@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 from torchstickcal.objective import Objective
 from torchstickcal.problem import State
 from torchstickcal.solvers.base import IterationRecord, Listener, Outcome, Stop, Termination
@@ -39,23 +41,34 @@ def gauss_newton(
             break
         if iteration == termination.max_iterations:
             break
-        moved = _descend(objective, state, system, damping, termination)
-        if isinstance(moved, Stop):
-            stop = moved
+        move = _descend(objective, state, system, damping, termination)
+        if isinstance(move, Stop):
+            stop = move
             break
-        state, step_m, damping, decrease = moved
-        converged = decrease <= termination.cost_tolerance * system.cost
-        if converged or step_m <= termination.step_tolerance_m:
-            stop = Stop.COST if converged else Stop.STEP
+        state, damping, step_m = move.state, move.damping, _largest_movement(move.step)
+        if move.decrease <= termination.cost_tolerance * system.cost:
+            stop = Stop.COST
+            break
+        if move.step.camera_sigmas <= termination.camera_tolerance:
+            stop = Stop.CAMERAS
             break
         system = linearise(objective, state, cameras_free)
     return Outcome(state, stop, tuple(records))
 
 
+class _Move(NamedTuple):
+    """An accepted step: where it led, by how much the cost fell, and the next damping."""
+
+    state: State
+    step: Step
+    decrease: float
+    damping: float
+
+
 def _descend(
     objective: Objective, state: State, system: NormalEquations, damping: float, termination: Termination
-) -> tuple[State, float, float, float] | Stop:
-    """The next state, the size of the step to it, the next damping and the decrease; or why there is none."""
+) -> _Move | Stop:
+    """Raise the damping until a step lowers the cost; or say why none does."""
     while damping <= _MAX_DAMPING:
         step = system.step(damping)
         if step is not None:
@@ -66,7 +79,7 @@ def _descend(
             if decrease > 0:
                 agreement = decrease / step.predicted_decrease
                 shrink = 0.1 if agreement > 0.75 else 1.0 if agreement > 0.25 else 4.0
-                return candidate, _largest_movement(step), max(damping * shrink, _MIN_DAMPING), decrease
+                return _Move(candidate, step, decrease, max(damping * shrink, _MIN_DAMPING))
             if step.predicted_decrease <= termination.cost_tolerance * system.cost:
                 return Stop.COST
         damping = max(damping, 1e-8) * 10

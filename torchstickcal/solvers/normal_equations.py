@@ -31,6 +31,8 @@ class Step(NamedTuple):
     points: Tensor
     """(3, N), metres"""
     predicted_decrease: float
+    camera_sigmas: float
+    """length of the cameras' step in standard deviations of their estimate; infinite where they are held"""
 
 
 @dataclass(frozen=True)
@@ -86,7 +88,8 @@ class NormalEquations:
         decrease = -float((self.camera_gradient * camera_step).sum() + (self.point_gradient * point_step).sum())
         camera_diagonal = self.camera_hessian.diagonal(dim1=1, dim2=2)
         decrease += damping * float((camera_diagonal * camera_step**2).sum() + (diagonal * point_step**2).sum())
-        return Step(camera_step, point_step, decrease)
+        squared_sigmas = -float((rhs * camera_step.flatten()).sum()) if rhs.numel() else math.inf
+        return Step(camera_step, point_step, decrease, math.sqrt(max(squared_sigmas, 0.0)))
 
     def point_variance(self) -> Tensor:
         """Mean variance along the axes of each point (N,), cameras known, stick ends taken singly, square metres."""

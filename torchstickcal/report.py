@@ -1,0 +1,111 @@
+"""A calibration told to a person, as a table, and to a program, as JSON."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+
+from torchstickcal.result import Calibration
+
+
+def table(calibration: Calibration) -> str:
+    """The calibration as a text to print: cameras, sticks, stages."""
+    cameras = zip(
+        calibration.camera_names,
+        calibration.camera_centres.tolist(),
+        calibration.reprojection_median_px.tolist(),
+        _keypoints_used(calibration),
+        strict=True,
+    )
+    rows = [["camera", "centre x, y, z (m)", "reprojection (px)", "keypoints"]]
+    rows += [[name, " ".join(f"{v:8.4f}" for v in centre), f"{px:.3f}", str(used)] for name, centre, px, used in cameras]
+    text = [_aligned(rows), ""]
+    if calibration.sticks:
+        rows = [["stick", "given (m)", "mean (m)", "spread (mm)", "frames"]]
+        for stick, lengths in zip(calibration.sticks, calibration.stick_lengths_m.mT, strict=True):
+            known = lengths[lengths.isfinite()]
+            spread = f"{1000 * float(known.std()):.2f}" if len(known) > 1 else "-"
+            ends = f"{_point_name(calibration, stick.start)} - {_point_name(calibration, stick.end)}"
+            mean = f"{float(known.mean()):.5f}" if len(known) else "-"
+            rows.append([ends, f"{stick.length_m:.5f}", mean, spread, str(len(known))])
+        text += [_aligned(rows), ""]
+    rows = [["stage", "iterations", "cost", "time (ms)", ""]]
+    rows.append(["initialise", "", "", f"{1000 * calibration.seconds['initialise']:.1f}", ""])
+    for stage in calibration.stages:
+        last = stage.iterations[-1]
+        rows.append([stage.name, str(last.iteration), f"{last.cost:.6g}", f"{1000 * stage.seconds:.1f}", str(stage.stop)])
+    rows.append(["total", "", "", f"{1000 * calibration.seconds['total']:.1f}", ""])
+    text.append(_aligned(rows))
+    text += ["", *(f"warning: {warning}" for warning in calibration.warnings)] if calibration.warnings else []
+    return "\n".join(text)
+
+
+def summary(calibration: Calibration) -> dict[str, Any]:
+    """The calibration without its arrays, as JSON can hold it."""
+    return {
+        "status": calibration.status,
+        "converged": calibration.converged,
+        "cameras": [
+            {
+                "name": name,
+                "centre_m": calibration.camera_centres[index].tolist(),
+                "rotation": calibration.rotations[index].tolist(),
+                "translation_m": calibration.translations[index].tolist(),
+                "reprojection_median_px": float(calibration.reprojection_median_px[index]),
+                "keypoints": _keypoints_used(calibration)[index],
+            }
+            for index, name in enumerate(calibration.camera_names)
+        ],
+        "points": [
+            {"name": _point_name(calibration, index), "sigma_px": sigma}
+            for index, sigma in enumerate(calibration.sigma_px.tolist())
+        ],
+        "sticks": [
+            {
+                "start": stick.start,
+                "end": stick.end,
+                "length_m": stick.length_m,
+                "mean_m": _finite(lengths.nanmean()),
+                "spread_m": _finite(lengths[lengths.isfinite()].std(correction=0)),
+                "frames": int(lengths.isfinite().sum()),
+            }
+            for stick, lengths in zip(calibration.sticks, calibration.stick_lengths_m.mT, strict=True)
+        ],
+        "stages": [
+            {
+                "name": stage.name,
+                "stop": stage.stop.value,
+                "converged": stage.stop.converged,
+                "iterations": stage.iterations[-1].iteration,
+                "cost": stage.iterations[-1].cost,
+                "seconds": stage.seconds,
+            }
+            for stage in calibration.stages
+        ],
+        "seconds": calibration.seconds,
+        "warnings": list(calibration.warnings),
+    }
+
+
+def _keypoints_used(calibration: Calibration) -> list[int]:
+    return calibration.inliers.flatten(1).sum(1).tolist()
+
+
+def _point_name(calibration: Calibration, index: int) -> str:
+    return calibration.point_names[index] if calibration.point_names else f"point {index}"
+
+
+def _finite(value: torch.Tensor) -> float | None:
+    """JSON has no NaN."""
+    return float(value) if bool(value.isfinite()) else None
+
+
+def _aligned(rows: list[list[str]]) -> str:
+    widths = [max(len(row[column]) for row in rows) for column in range(len(rows[0]))]
+    lines = [
+        "  ".join(cell.ljust(w) if column == 0 or not cell[:1].isdigit() and cell[:1] not in "- " else cell.rjust(w)
+                  for column, (cell, w) in enumerate(zip(row, widths, strict=True))).rstrip()
+        for row in rows
+    ]  # fmt: skip
+    return "\n".join([lines[0], "-" * max(map(len, lines)), *lines[1:]])
