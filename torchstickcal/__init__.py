@@ -1,0 +1,79 @@
+"""Metric extrinsic calibration of multi-camera rigs from an athlete's keypoints and a stick of known length.
+
+    from torchstickcal import Observations, Stick, calibrate
+
+    observations = Observations(keypoints, intrinsics, Stick(start=19, end=20, length_m=1.0))
+    calibration = calibrate(observations)
+"""
+
+from __future__ import annotations
+
+from importlib import import_module
+from importlib.metadata import version
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from torchstickcal.calibrate import Callback, calibrate
+    from torchstickcal.cameras import Intrinsics
+    from torchstickcal.config import Config, config_names, load_config
+    from torchstickcal.errors import CalibrationError, ConfigError, FileFormatError, ObservationError, RigError
+    from torchstickcal.extrinsics import Extrinsics
+    from torchstickcal.monitor import TensorBoardMonitor
+    from torchstickcal.observations import Observations, Stick
+    from torchstickcal.result import Calibration
+
+__version__ = version("torchstickcal")
+
+_HOMES = {
+    "Calibration": "result",
+    "CalibrationError": "errors",
+    "Callback": "calibrate",
+    "Config": "config",
+    "ConfigError": "errors",
+    "Extrinsics": "extrinsics",
+    "FileFormatError": "errors",
+    "Intrinsics": "cameras",
+    "ObservationError": "errors",
+    "Observations": "observations",
+    "RigError": "errors",
+    "Stick": "observations",
+    "TensorBoardMonitor": "monitor",
+    "calibrate": "calibrate",
+    "config_names": "config",
+    "load_config": "config",
+}
+_SUBPACKAGES = {"io", "losses", "metrics", "simulate"}
+
+__all__ = [
+    "Calibration",
+    "CalibrationError",
+    "Callback",
+    "Config",
+    "ConfigError",
+    "Extrinsics",
+    "FileFormatError",
+    "Intrinsics",
+    "ObservationError",
+    "Observations",
+    "RigError",
+    "Stick",
+    "TensorBoardMonitor",
+    "calibrate",
+    "config_names",
+    "load_config",
+]
+
+
+def __getattr__(name: str) -> Any:
+    """Import a public name when it is first used, so that importing the package costs nothing."""
+    if name in _SUBPACKAGES:
+        return import_module(f"torchstickcal.{name}")
+    if name not in _HOMES:
+        raise AttributeError(f"module 'torchstickcal' has no attribute {name!r}")
+    value = getattr(import_module(f"torchstickcal.{_HOMES[name]}"), name)
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    return sorted([*__all__, *_SUBPACKAGES])

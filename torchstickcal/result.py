@@ -83,7 +83,7 @@ class Calibration:
     @property
     def camera_centres(self) -> Tensor:
         """(C, 3), metres."""
-        return se3.camera_centres(self.rotations, self.translations)
+        return se3.camera_centres(self.rotations, self.translations) + 0.0
 
     @property
     def reprojection_rms_px(self) -> Tensor:

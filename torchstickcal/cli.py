@@ -1,0 +1,252 @@
+"""The command line. What needs torch is imported when a command runs, so that help and usage errors come at once."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from torchstickcal.errors import CalibrationError
+
+if TYPE_CHECKING:
+    from torchstickcal.calibrate import Callback
+    from torchstickcal.io import Truth
+    from torchstickcal.result import Calibration
+    from torchstickcal.solvers import IterationRecord
+
+EXIT_DONE, EXIT_NOT_CONVERGED, EXIT_UNUSABLE = 0, 1, 2
+CAMERAS_FILE, POINTS_FILE, REPORT_FILE = "calibration.toml", "points.npz", "report.json"
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run a command; returns the exit status."""
+    options = _parser().parse_args(arguments)
+    try:
+        return options.run(options)
+    except (CalibrationError, OSError) as error:
+        print(f"error: {error}", file=sys.stderr)
+        return EXIT_UNUSABLE
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="torchstickcal",
+        description="Calibrate the extrinsics of a camera rig, in metres, from an athlete's keypoints and a stick of known length.",
+    )
+    commands = parser.add_subparsers(metavar="COMMAND", required=True)
+
+    command = commands.add_parser("calibrate", help="calibrate a session", description="Calibrate a session.")
+    command.add_argument("session", metavar="SESSION", type=Path, help="an .npz session or a Sports-Stick-Syn .pkl")
+    command.add_argument("--out", metavar="DIR", type=Path, required=True, help="folder for the results, made if need be")
+    _add_config(command)
+    command.add_argument("--stick-length", metavar="M", type=float, help="length of the stick in metres, if not the session's")
+    command.add_argument("--tensorboard", metavar="DIR", type=Path, help="write a TensorBoard log of the calibration")
+    command.set_defaults(run=_calibrate)
+
+    command = commands.add_parser(
+        "evaluate", help="compare a calibration with the truth", description="Compare a calibration with the truth."
+    )
+    command.add_argument("calibration", metavar="DIR", type=Path, help=f"a folder with {CAMERAS_FILE}, or such a file")
+    command.add_argument("truth", metavar="TRUTH", type=Path, help="a session that carries its truth, or as DIR")
+    command.add_argument("--json", metavar="FILE", type=Path, help="write the errors as JSON")
+    command.set_defaults(run=_evaluate)
+
+    command = commands.add_parser(
+        "benchmark", help="calibrate a folder of sessions with truth", description="Calibrate a folder of sessions with truth."
+    )
+    command.add_argument("folder", metavar="FOLDER", type=Path, help="a folder of sessions")
+    command.add_argument("--json", metavar="FILE", type=Path, help="write the scores as JSON")
+    _add_config(command)
+    command.set_defaults(run=_benchmark)
+
+    command = commands.add_parser(
+        "demo",
+        help="calibrate a generated golf swing",
+        description="Generate a golf swing seen by six cameras, with noise, gaps and outliers; calibrate it; show the result.",
+    )
+    command.add_argument("--out", metavar="DIR", type=Path, default=Path("demo"), help="folder for the results (default: demo)")
+    command.add_argument("--seed", type=int, default=0, help="of everything random (default: 0)")
+    command.set_defaults(run=_demo)
+    return parser
+
+
+def _add_config(command: argparse.ArgumentParser) -> None:
+    command.add_argument("--config", metavar="NAME|FILE", default="default", help="a configuration (default: default)")
+
+
+def _calibrate(options: argparse.Namespace) -> int:
+    from torchstickcal.calibrate import calibrate
+    from torchstickcal.config import load_config
+    from torchstickcal.io import read_session
+
+    config = load_config(options.config)
+    observations, _ = read_session(options.session)
+    if options.stick_length is not None:
+        observations = observations.with_stick_length(options.stick_length)
+    calibration = calibrate(observations, config, _Progress(_monitor(options.tensorboard)))
+    _write(calibration, options.out, {"session": str(options.session), "config": options.config})
+    return _show(calibration, options.out)
+
+
+def _evaluate(options: argparse.Namespace) -> int:
+    from torchstickcal.metrics import pose_errors
+
+    names, estimate = _poses(options.calibration)
+    _, truth = _poses(options.truth)
+    if len(estimate.rotations) != len(truth.rotations):
+        raise CalibrationError(
+            "the number of cameras differs",
+            where=str(options.truth),
+            got=f"{len(truth.rotations)} cameras",
+            expected=f"{len(estimate.rotations)} as in {options.calibration}",
+        )
+    errors = pose_errors(estimate.rotations, estimate.translations, truth.rotations, truth.translations)
+    result = {
+        "mean_rotation_deg": errors.mean_rotation_deg,
+        "mean_translation_m": errors.mean_translation_m,
+        "cameras": [
+            {"name": name, "rotation_deg": rotation, "translation_m": translation}
+            for name, rotation, translation in zip(
+                names, errors.rotation_deg.tolist(), errors.translation_m.tolist(), strict=True
+            )
+        ],
+    }
+    _print_errors(result)
+    _write_json(options.json, result)
+    return EXIT_DONE
+
+
+def _benchmark(options: argparse.Namespace) -> int:
+    from torchstickcal.benchmark import score_sequences, session_files, summarise
+    from torchstickcal.config import load_config
+
+    config = load_config(options.config)
+    files = session_files(options.folder)
+    width = max(len(file.stem) for file in files)
+    scores = []
+    print(f"{'session':{width}}  rotation (deg)  translation (mm)  time (ms)  status")
+    for score in score_sequences(files, config):
+        scores.append(score)
+        rotation = "-" if score.rotation_deg is None else f"{score.rotation_deg:.5f}"
+        translation = "-" if score.translation_m is None else f"{1000 * score.translation_m:.3f}"
+        print(f"{score.name:{width}}  {rotation:>14}  {translation:>16}  {1000 * score.seconds:9.0f}  {score.status}", flush=True)
+    summary = summarise(scores)
+    if summary["mean_rotation_deg"] is not None:
+        mean = f"{summary['mean_rotation_deg']:14.5f}  {1000 * summary['mean_translation_m']:16.3f}"
+        print(f"{'mean':{width}}  {mean}  {'':9}  {summary['converged']} of {len(scores)} converged")
+    _write_json(options.json, summary)
+    return EXIT_DONE if scores and summary["converged"] == len(scores) else EXIT_NOT_CONVERGED
+
+
+def _demo(options: argparse.Namespace) -> int:
+    from torchstickcal.calibrate import calibrate
+    from torchstickcal.figures import rig_figure
+    from torchstickcal.files import atomic_path
+    from torchstickcal.io import write_npz
+    from torchstickcal.metrics import pose_errors
+    from torchstickcal.simulate import Noise, golf_session
+
+    print("A golf swing seen by 6 cameras: 240 frames, 1.5 px noise, 15 % of the keypoints missing, 5 % wrong by up to 150 px.\n")
+    observations, truth = golf_session(noise=Noise(sigma_px=1.5, missing=0.15, outliers=0.05), seed=options.seed)
+    calibration = calibrate(observations, callback=_Progress(None))
+    options.out.mkdir(parents=True, exist_ok=True)
+    write_npz(options.out / "session.npz", observations, truth)
+    _write(calibration, options.out, {"session": str(options.out / "session.npz"), "config": "default"})
+    with atomic_path(options.out / "rig.png") as temporary:
+        rig_figure(calibration).savefig(temporary, format="png", dpi=120)
+    status = _show(calibration, options.out)
+    print(f"picture in {options.out / 'rig.png'}\n\nAgainst the truth:")
+    errors = pose_errors(calibration.rotations, calibration.translations, truth.rotations, truth.translations)
+    rows = zip(calibration.camera_names, errors.rotation_deg.tolist(), errors.translation_m.tolist(), strict=True)
+    _print_errors(
+        {
+            "mean_rotation_deg": errors.mean_rotation_deg,
+            "mean_translation_m": errors.mean_translation_m,
+            "cameras": [{"name": n, "rotation_deg": r, "translation_m": t} for n, r, t in rows],
+        }
+    )
+    return status
+
+
+class _Progress:
+    """Shows the iterations on a terminal's last line; passes everything on to another callback."""
+
+    def __init__(self, following: Callback | None) -> None:
+        self._following = following
+        self._live = sys.stderr.isatty()
+
+    def on_iteration(self, record: IterationRecord) -> None:
+        if self._live:
+            line = f"{record.stage}: iteration {record.iteration}, cost {record.cost:.6g}"
+            print(f"\r{line:<70}", end="", file=sys.stderr, flush=True)
+        if self._following:
+            self._following.on_iteration(record)
+
+    def on_end(self, calibration: Calibration) -> None:
+        if self._live:
+            print(f"\r{'':<70}\r", end="", file=sys.stderr, flush=True)
+        if self._following:
+            self._following.on_end(calibration)
+
+
+def _monitor(log_dir: Path | None) -> Callback | None:
+    if log_dir is None:
+        return None
+    from torchstickcal.monitor import TensorBoardMonitor
+
+    return TensorBoardMonitor(log_dir)
+
+
+def _write(calibration: Calibration, folder: Path, provenance: dict[str, str]) -> None:
+    from torchstickcal.io import write_camera_toml
+    from torchstickcal.report import summary
+
+    folder.mkdir(parents=True, exist_ok=True)
+    write_camera_toml(folder / CAMERAS_FILE, calibration)
+    calibration.save(folder / POINTS_FILE)
+    _write_json(folder / REPORT_FILE, provenance | summary(calibration))
+
+
+def _show(calibration: Calibration, folder: Path) -> int:
+    from torchstickcal.report import table
+
+    print(table(calibration))
+    print(f"\n{CAMERAS_FILE}, {POINTS_FILE}, {REPORT_FILE} in {folder}")
+    if calibration.converged:
+        return EXIT_DONE
+    print(f"not converged: {calibration.status}", file=sys.stderr)
+    return EXIT_NOT_CONVERGED
+
+
+def _poses(path: Path) -> tuple[tuple[str, ...], Truth]:
+    """Camera names and poses of a folder or file of cameras, or of a session that carries them."""
+    from torchstickcal.errors import FileFormatError
+    from torchstickcal.io import Truth, read_camera_toml, read_session
+
+    file = path / CAMERAS_FILE if path.is_dir() else path
+    if file.suffix == ".toml":
+        rig = read_camera_toml(file)
+        return rig.names, Truth(rig.rotations, rig.translations)
+    observations, truth = read_session(file)
+    if truth is None:
+        raise FileFormatError("a session without truth", where=str(file), got="no rotation", expected="rotation and translation")
+    return tuple(map(observations.camera_label, range(observations.num_cameras))), truth
+
+
+def _print_errors(errors: dict[str, Any]) -> None:
+    width = max(6, *(len(camera["name"]) for camera in errors["cameras"]))
+    print(f"{'camera':{width}}  rotation (deg)  translation (mm)")
+    mean = {"name": "mean", "rotation_deg": errors["mean_rotation_deg"], "translation_m": errors["mean_translation_m"]}
+    for camera in [*errors["cameras"], mean]:
+        print(f"{camera['name']:{width}}  {camera['rotation_deg']:14.5f}  {1000 * camera['translation_m']:16.3f}")
+
+
+def _write_json(path: Path | None, content: dict[str, Any]) -> None:
+    from torchstickcal.files import atomic_path
+
+    if path is not None:
+        with atomic_path(path) as temporary:
+            temporary.write_text(json.dumps(content, indent=2) + "\n", "utf-8")
