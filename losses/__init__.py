@@ -4,7 +4,7 @@ Installed as ``torchstickcal.losses``.
 """
 
 if __name__ == "losses":
-    raise ImportError("This folder is the package torchstickcal.losses: write `import torchstickcal.losses`, not `import losses`.")
+    raise ImportError("This folder is torchstickcal.losses: write `import torchstickcal.losses`, not `import losses`.")
 
 from torchstickcal.losses.base import CameraPointLoss, Loss, PairLoss, TrackLoss
 from torchstickcal.losses.reprojection import ReprojectionLoss, reprojection_residuals

@@ -20,7 +20,6 @@ from torchstickcal.result import Calibration
 from torchstickcal.solvers import IterationRecord
 from torchstickcal.stages import StageRecord, rulers, run_stage
 
-
 _USELESS_FOCAL_SHARE = 0.03
 
 
@@ -140,13 +139,13 @@ def _stick_lengths(observations: Observations, points: Tensor) -> Tensor:
 
 def _warnings(observations: Observations, measurements: Measurements, used: Measurements, sigma_px: Tensor) -> tuple[str, ...]:
     found: list[str] = []
-    seen, comparable = measurements.by_frame(observations.visible.flatten(1)), measurements.by_frame(measurements.visible)
-    total, alone = int(comparable.sum()), int((seen & ~comparable).sum())
-    outliers = total - int(used.visible.sum())
-    if alone:
-        found.append(f"{alone} of {int(seen.sum())} keypoints took no part: no second camera saw the point, or it was not asked for.")
-    if outliers:
-        found.append(f"{outliers} of {total} keypoints ({outliers / total:.1%}) contradict the rest and were set aside.")
+    comparable, kept = int(measurements.visible.sum()), int(used.visible.sum())
+    seen = int(observations.visible[:, :, measurements.by_frame(measurements.active).any(0)].sum())
+    if seen > comparable:
+        found.append(f"{seen - comparable} of {seen} keypoints took no part: no second camera saw the point.")
+    if comparable > kept:
+        share = (comparable - kept) / comparable
+        found.append(f"{comparable - kept} of {comparable} keypoints ({share:.1%}) contradict the rest and were set aside.")
     blurred = (sigma_px > _USELESS_FOCAL_SHARE * measurements.cameras.focal_px.mean()).nonzero().flatten().tolist()
     if blurred:
         names = ", ".join(observations.point_label(point) for point in blurred)

@@ -34,7 +34,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog="torchstickcal",
-        description="Calibrate the extrinsics of a camera rig, in metres, from an athlete's keypoints and a stick of known length.",
+        description="Calibrate a camera rig, in metres, from an athlete's keypoints and a stick of known length.",
     )
     commands = parser.add_subparsers(metavar="COMMAND", required=True)
 
@@ -132,7 +132,9 @@ def _benchmark(options: argparse.Namespace) -> int:
         scores.append(score)
         rotation = "-" if score.rotation_deg is None else f"{score.rotation_deg:.5f}"
         translation = "-" if score.translation_m is None else f"{1000 * score.translation_m:.3f}"
-        print(f"{score.name:{width}}  {rotation:>14}  {translation:>16}  {1000 * score.seconds:9.0f}  {score.status}", flush=True)
+        print(
+            f"{score.name:{width}}  {rotation:>14}  {translation:>16}  {1000 * score.seconds:9.0f}  {score.status}", flush=True
+        )
     summary = summarise(scores)
     if summary["mean_rotation_deg"] is not None:
         mean = f"{summary['mean_rotation_deg']:14.5f}  {1000 * summary['mean_translation_m']:16.3f}"
@@ -149,7 +151,9 @@ def _demo(options: argparse.Namespace) -> int:
     from torchstickcal.metrics import pose_errors
     from torchstickcal.simulate import Noise, golf_session
 
-    print("A golf swing seen by 6 cameras: 240 frames, 1.5 px noise, 15 % of the keypoints missing, 5 % wrong by up to 150 px.\n")
+    print(
+        "A golf swing seen by 6 cameras: 240 frames, 1.5 px noise, 15 % of the keypoints missing, 5 % wrong by up to 150 px.\n"
+    )
     observations, truth = golf_session(noise=Noise(sigma_px=1.5, missing=0.15, outliers=0.05), seed=options.seed)
     calibration = calibrate(observations, callback=_Progress(None))
     options.out.mkdir(parents=True, exist_ok=True)
@@ -232,7 +236,9 @@ def _poses(path: Path) -> tuple[tuple[str, ...], Truth]:
         return rig.names, Truth(rig.rotations, rig.translations)
     observations, truth = read_session(file)
     if truth is None:
-        raise FileFormatError("a session without truth", where=str(file), got="no rotation", expected="rotation and translation")
+        raise FileFormatError(
+            "a session without truth", where=str(file), got="no rotation", expected="rotation and translation"
+        )
     return tuple(map(observations.camera_label, range(observations.num_cameras))), truth
 
 

@@ -43,12 +43,12 @@ def rig_figure(calibration: Calibration, frame: int | None = None) -> Figure:
     to_plot = _upright(calibration)
     points = _plotted(calibration.points, to_plot)
     corners = _plotted(_frusta(calibration), to_plot)
-    figure = Figure(figsize=(8, 7), layout="tight")
+    figure = Figure(figsize=(9, 6), layout="tight")
     axes = cast(Axes3D, figure.add_subplot(projection="3d"))
     for name, (apex, *base) in zip(calibration.camera_names, corners, strict=True):
         for first, second in [*((apex, corner) for corner in base), *itertools.pairwise([*base, base[0]])]:
             axes.plot(*np.stack([first, second]).T, color=_CAMERA_COLOUR, linewidth=1.2)
-        axes.text(*apex, f" {name}", color=_CAMERA_COLOUR, fontsize=8)
+        axes.text(apex[0], apex[1], apex[2], f" {name}", color=_CAMERA_COLOUR, fontsize=8)
     step = max(1, len(points) // _GHOST_FRAMES)
     for stick in calibration.sticks:
         for ends in points[::step, [stick.start, stick.end]]:
@@ -104,8 +104,9 @@ def _central(points: NDArray[np.float64]) -> NDArray[np.float64]:
 
 def _equal_axes(axes: Axes3D, points: NDArray[np.float64]) -> None:
     low, high = points.min(0), points.max(0)
-    middle, radius = (low + high) / 2, (high - low).max() / 2
-    axes.set_xlim(middle[0] - radius, middle[0] + radius)
-    axes.set_ylim(middle[1] - radius, middle[1] + radius)
-    axes.set_zlim(middle[2] - radius, middle[2] + radius)
-    axes.set_box_aspect((1, 1, 1))
+    margin = 0.03 * (high - low).max()
+    low, high = low - margin, high + margin
+    axes.set_xlim(low[0], high[0])
+    axes.set_ylim(low[1], high[1])
+    axes.set_zlim(low[2], high[2])
+    axes.set_box_aspect(tuple(high - low), zoom=1.3)  # pyright: ignore[reportArgumentType]

@@ -280,7 +280,10 @@ class Observations:
             ends += [stick.start, stick.end]
             if len(set(ends)) != len(ends):
                 raise ObservationError(
-                    "two sticks share an end", where=where, got=f"start {stick.start}, end {stick.end}", expected="disjoint ends"
+                    "two sticks share an end",
+                    where=where,
+                    got=f"start {stick.start}, end {stick.end}",
+                    expected="disjoint ends",
                 )
             views = self.visible.sum(0)
             if not bool(((views[:, stick.start] >= 2) & (views[:, stick.end] >= 2)).any()):

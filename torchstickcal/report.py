@@ -104,7 +104,7 @@ def _finite(value: torch.Tensor) -> float | None:
 def _aligned(rows: list[list[str]]) -> str:
     widths = [max(len(row[column]) for row in rows) for column in range(len(rows[0]))]
     lines = [
-        "  ".join(cell.ljust(w) if column == 0 or not cell[:1].isdigit() and cell[:1] not in "- " else cell.rjust(w)
+        "  ".join(cell.ljust(w) if column == 0 or (not cell[:1].isdigit() and cell[:1] not in "- ") else cell.rjust(w)
                   for column, (cell, w) in enumerate(zip(row, widths, strict=True))).rstrip()
         for row in rows
     ]  # fmt: skip

@@ -22,8 +22,16 @@ from torchstickcal.stages import StageRecord
 
 _FORMAT = "torchstickcal calibration 1"
 _TENSORS = (
-    "rotations", "translations", "points", "residuals_px", "inliers", "stick_lengths_m", "sigma_px", "intrinsics", "distortion", "image_size",
-)  # fmt: skip
+    "rotations",
+    "translations",
+    "points",
+    "residuals_px",
+    "inliers",
+    "stick_lengths_m",
+    "sigma_px",
+    "intrinsics",
+)
+_OPTIONAL_TENSORS = ("distortion", "image_size")
 
 
 @dataclass(frozen=True, eq=False)
@@ -100,7 +108,8 @@ class Calibration:
 
     def save(self, path: str | Path) -> None:
         """Write everything to one ``.npz`` file."""
-        arrays = {n: getattr(self, n).detach().cpu().numpy() for n in _TENSORS if getattr(self, n) is not None}
+        tensors = {name: getattr(self, name) for name in (*_TENSORS, *_OPTIONAL_TENSORS)}
+        arrays = {name: tensor.detach().cpu().numpy() for name, tensor in tensors.items() if tensor is not None}
         meta = {
             "format": _FORMAT,
             "fisheye": self.fisheye,
@@ -129,7 +138,9 @@ class Calibration:
             if meta.pop("format") != _FORMAT:
                 raise KeyError("format")
             return Calibration(
-                **{name: arrays.get(name) for name in _TENSORS},
+                **{name: arrays[name] for name in _TENSORS},
+                distortion=arrays.get("distortion"),
+                image_size=arrays.get("image_size"),
                 fisheye=meta["fisheye"],
                 sticks=tuple(Stick(*stick) for stick in meta["sticks"]),
                 fps=meta["fps"],
@@ -138,7 +149,7 @@ class Calibration:
                 stages=tuple(_stage_record(stage) for stage in meta["stages"]),
                 seconds=meta["seconds"],
                 warnings=tuple(meta["warnings"]),
-            )  # type: ignore[arg-type]
+            )
         except (KeyError, TypeError, ValueError, EOFError, zipfile.BadZipFile) as error:
             raise FileFormatError(
                 "not a saved calibration", where=str(path), got=repr(error), expected="a file written by Calibration.save"

@@ -44,9 +44,7 @@ def spanning_tree(pairs: Sequence[Pair], labels: Sequence[str], min_common: int)
     return edges
 
 
-def propagate(
-    edges: Sequence[Edge], rays: Array, visible: NDArray[np.bool_], scale: float
-) -> tuple[Array, Array]:
+def propagate(edges: Sequence[Edge], rays: Array, visible: NDArray[np.bool_], scale: float) -> tuple[Array, Array]:
     """Poses of all cameras, world to camera, in the frame of the first; the first edge has length 1.
 
     A pose out of an essential matrix is one of four, and the count of points in front of both cameras does not always
@@ -78,7 +76,9 @@ def _grow(
     support = float(root.in_front)
     for edge in edges[1:]:
         known = triangulate(
-            *(torch.from_numpy(np.ascontiguousarray(v[placed])) for v in (rotations, translations, rays)),
+            torch.from_numpy(rotations[placed]),
+            torch.from_numpy(translations[placed]),
+            torch.from_numpy(rays[placed]),
             torch.from_numpy(visible[placed]).double(),
             scale=scale,
         ).numpy()

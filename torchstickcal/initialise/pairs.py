@@ -104,13 +104,13 @@ def _sampson_distance(essential: Array, a: Array, b: Array) -> Array:
 
 def _decompose(essential: Array, a: Array, b: Array) -> tuple[RelativePose, ...]:
     """The four poses of an essential matrix, by falling number of points in front of both cameras."""
-    rotation_1, rotation_2, direction = cv2.decomposeEssentialMat(essential)
+    rotation_1, rotation_2, direction = (np.asarray(v, dtype=np.float64) for v in cv2.decomposeEssentialMat(essential))
     poses: list[RelativePose] = []
     for rotation in (rotation_1, rotation_2):
         depth_a, depth_b = two_view_depths(rotation, direction[:, 0], a, b)
         for sign in (1.0, -1.0):
             in_front = int(((sign * depth_a > 0) & (sign * depth_b > 0)).sum())
-            poses.append(RelativePose(np.asarray(rotation), sign * direction[:, 0], in_front))
+            poses.append(RelativePose(rotation, sign * direction[:, 0], in_front))
     return tuple(sorted(poses, key=lambda pose: -pose.in_front))
 
 

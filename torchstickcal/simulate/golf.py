@@ -43,9 +43,7 @@ class Noise:
     outlier_px: float = 150.0
 
 
-def golf_session(
-    cameras: int = 6, frames: int = 240, noise: Noise | None = None, seed: int = 0
-) -> tuple[Observations, Truth]:
+def golf_session(cameras: int = 6, frames: int = 240, noise: Noise | None = None, seed: int = 0) -> tuple[Observations, Truth]:
     """A right-handed swing, 2.4 s long, with a club of 1 m, seen by cameras on a ring of 4.5 m.
 
     Args:

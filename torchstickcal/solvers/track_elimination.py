@@ -36,7 +36,9 @@ class BlockTridiagonal:
         while diagonal.shape[-3] > 1:
             lower = torch.linalg.cholesky(diagonal[..., 1::2, :, :])
             left = torch.linalg.solve_triangular(lower, below[..., 0::2, :, :], upper=False)
-            right = torch.linalg.solve_triangular(lower[..., : below.shape[-3] // 2, :, :], below[..., 1::2, :, :].mT, upper=False)
+            right = torch.linalg.solve_triangular(
+                lower[..., : below.shape[-3] // 2, :, :], below[..., 1::2, :, :].mT, upper=False
+            )
             diagonal = diagonal[..., 0::2, :, :].clone()
             diagonal[..., : left.shape[-3], :, :] -= left.mT @ left
             diagonal[..., 1 : 1 + right.shape[-3], :, :] -= right.mT @ right

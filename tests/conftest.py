@@ -1,0 +1,50 @@
+"""Scenes and data shared by the tests."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import pytest
+import torch
+
+from torchstickcal.io import Truth
+from torchstickcal.observations import Observations
+from torchstickcal.problem import Measurements, State
+from torchstickcal.simulate import Noise, golf_session
+
+_DATA = Path(os.environ.get("TORCHSTICKCAL_DATA", Path(__file__).parents[2] / "shared" / "data"))
+
+
+@pytest.fixture(scope="session")
+def data() -> Path:
+    """The folder of recorded sessions; tests that need it are skipped where it is absent."""
+    if not _DATA.is_dir():
+        pytest.skip(f"no recorded sessions at {_DATA}; set TORCHSTICKCAL_DATA to their folder")
+    return _DATA
+
+
+@pytest.fixture
+def perfect() -> tuple[Observations, Truth]:
+    """A golf swing seen by four cameras without noise."""
+    return golf_session(cameras=4, frames=30)
+
+
+@pytest.fixture
+def noisy() -> tuple[Observations, Truth]:
+    """The same with noise and gaps."""
+    return golf_session(cameras=4, frames=30, noise=Noise(sigma_px=1.0, missing=0.1))
+
+
+@pytest.fixture
+def disturbed(noisy: tuple[Observations, Truth]) -> tuple[Measurements, State]:
+    """A session in the solvers' layout and a state some way from the minimum."""
+    observations, truth = noisy
+    assert truth.points is not None
+    generator = torch.Generator().manual_seed(3)
+    measurements = Measurements.of(observations)
+    points = truth.points.flatten(0, 1).mT.contiguous()
+    start = State(truth.rotations, truth.translations, points)
+    step = 0.01 * torch.randn(len(truth.rotations) - 1, 6, generator=generator, dtype=torch.float64)
+    shift = 0.01 * torch.randn(points.shape, generator=generator, dtype=torch.float64)
+    return measurements, start.retracted(step, shift)

@@ -1,0 +1,102 @@
+"""Eliminations against dense linear algebra."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from torch import Tensor
+
+from torchstickcal.solvers.point_elimination import PointElimination, StickCoupling
+from torchstickcal.solvers.track_elimination import BlockTridiagonal, TrackElimination
+
+P = 5
+PAIRS = torch.tensor([[3, 4], [1, 0]])
+
+
+def entries(blocks: Tensor) -> Tensor:
+    return torch.stack([blocks[i, j] for i, j in ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))])
+
+
+def system(frames: int, smooth: bool) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+    """Dense matrix (ordered frame, point, axis), diagonal blocks, stick coupling, and couplings between frames."""
+    generator = torch.Generator().manual_seed(frames)
+
+    def random(*shape: int) -> Tensor:
+        return torch.randn(*shape, generator=generator, dtype=torch.float64)
+
+    a, b = random(3, 3, frames, P), random(3, 3, frames, 2)
+    blocks = torch.einsum("ikfp,jkfp->ijfp", a, a) + torch.eye(3, dtype=torch.float64)[..., None, None]
+    coupling = torch.einsum("ikfs,jkfs->ijfs", b, b)
+    blocks[..., PAIRS] += coupling[..., None]
+    dense = torch.zeros(frames, P, 3, frames, P, 3, dtype=torch.float64)
+    for s, (start, end) in enumerate(PAIRS.tolist()):
+        for f in range(frames):
+            dense[f, start, :, f, end, :] = dense[f, end, :, f, start, :] = -coupling[:, :, f, s]
+    next_frame = torch.zeros(frames - 1, P, dtype=torch.float64)
+    second_frame = torch.zeros(max(frames - 2, 0), P, dtype=torch.float64)
+    if smooth:
+        stencil = torch.zeros(frames - 2, frames, dtype=torch.float64)
+        for f in range(frames - 2):
+            stencil[f, f : f + 3] = torch.tensor([1.0, -2, 1])
+        for p in range(P):
+            track = stencil.mT @ torch.diag(random(frames - 2).square()) @ stencil
+            next_frame[:, p], second_frame[:, p] = track.diagonal(1), track.diagonal(2)
+            for axis in range(3):
+                dense[:, p, axis, :, p, axis] += track - torch.diag(track.diagonal())
+                blocks[axis, axis, :, p] += track.diagonal()
+    for f in range(frames):
+        for p in range(P):
+            dense[f, p, :, f, p, :] = blocks[:, :, f, p]
+    return dense.reshape(frames * P * 3, -1), entries(blocks), entries(coupling), next_frame, second_frame
+
+
+def flat(columns: Tensor) -> Tensor:
+    return columns.mT.flatten()
+
+
+def check(elimination: PointElimination | TrackElimination, dense: Tensor) -> None:
+    right = torch.randn(4, 3, dense.shape[0] // 3, dtype=torch.float64)
+    matrix = torch.stack([flat(columns) for columns in right])
+    half = elimination.half_solve(right)
+    torch.testing.assert_close(half @ half.mT, matrix @ torch.linalg.solve(dense, matrix.mT), rtol=1e-12, atol=1e-12)
+    torch.testing.assert_close(flat(elimination.solve(right[0])), torch.linalg.solve(dense, matrix[0]), rtol=1e-11, atol=1e-12)
+
+
+@pytest.mark.parametrize("frames", [2, 3, 7])
+def test_points_and_sticks(frames: int):
+    dense, blocks, coupling, *_ = system(frames, smooth=False)
+    first = P * torch.arange(frames)[:, None]
+    starts, ends = ((first + PAIRS[:, k]).flatten() for k in (0, 1))
+    check(PointElimination(blocks.flatten(1), StickCoupling(starts, ends, coupling.flatten(1))), dense)
+
+
+def test_points_alone():
+    _, blocks, *_ = system(4, smooth=False)
+    matrices = blocks.flatten(1)[[0, 1, 2, 1, 3, 4, 2, 4, 5]].mT.reshape(-1, 3, 3)
+    check(PointElimination(blocks.flatten(1), None), torch.block_diag(*matrices))
+
+
+@pytest.mark.parametrize("frames", [3, 4, 5, 8, 11])
+def test_tracks(frames: int):
+    dense, blocks, coupling, next_frame, second_frame = system(frames, smooth=True)
+    check(TrackElimination(blocks, PAIRS, coupling, next_frame, second_frame), dense)
+
+
+@pytest.mark.parametrize("count", [1, 2, 3, 6, 9])
+def test_block_tridiagonal(count: int):
+    torch.manual_seed(count)
+    lower = torch.randn(2, count, 4, 4, dtype=torch.float64).tril() + 3 * torch.eye(4, dtype=torch.float64)
+    below = torch.randn(2, count - 1, 4, 4, dtype=torch.float64)
+    factor = torch.zeros(2, count, 4, count, 4, dtype=torch.float64)
+    for g in range(count):
+        factor[:, g, :, g] = lower[:, g]
+        if g:
+            factor[:, g, :, g - 1] = below[:, g - 1]
+    factor = factor.reshape(2, 4 * count, 4 * count)
+    dense = (factor @ factor.mT).reshape(2, count, 4, count, 4)
+    diagonal = torch.stack([dense[:, g, :, g] for g in range(count)], dim=1)
+    under = [dense[:, g + 1, :, g] for g in range(count - 1)]
+    solver = BlockTridiagonal(diagonal, torch.stack(under, dim=1) if under else diagonal.new_zeros(2, 0, 4, 4))
+    right = torch.randn(2, count, 4, 3, dtype=torch.float64)
+    expected = torch.linalg.solve(factor @ factor.mT, right.reshape(2, -1, 3)).reshape(right.shape)
+    torch.testing.assert_close(solver.back_solve(solver.half_solve(right)), expected, rtol=1e-9, atol=1e-10)
