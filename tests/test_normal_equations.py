@@ -23,7 +23,7 @@ LOSSES: dict[str, dict[str, Loss]] = {
 }
 
 
-def dense_system(objective: Objective, state: State) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+def dense_system(objective: Objective, state: State) -> tuple[torch.Tensor, torch.Tensor, float]:
     """Hessian and gradient of the weighted residuals by all unknowns (cameras but the first, then points), and the cost."""
     m = objective.measurements
     shape = (m.frames, m.points_per_frame, 3)
@@ -58,7 +58,7 @@ def dense_system(objective: Objective, state: State) -> tuple[torch.Tensor, torc
     jacobians = torch.autograd.functional.jacobian(lambda *x: torch.cat(residuals(*x)), arguments)
     jacobian = torch.cat([j.flatten(1) for j in jacobians], dim=1)
     residual = torch.cat(residuals(*arguments))
-    return jacobian.mT @ jacobian, jacobian.mT @ residual, objective.cost(state)
+    return (jacobian.mT @ jacobian).detach(), (jacobian.mT @ residual).detach(), objective.cost(state)
 
 
 @pytest.mark.parametrize("losses", LOSSES.values(), ids=LOSSES.keys())

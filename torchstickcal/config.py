@@ -137,9 +137,12 @@ def load_config(config: str | Path | Mapping[str, Any] | Config = "default") -> 
     """
     if isinstance(config, Config):
         return config
-    if isinstance(config, Mapping):
-        return _build(Config, _extended(dict(config), "mapping"), "mapping", ())
-    return _build(Config, _read(config), str(config), ())
+    where = "mapping" if isinstance(config, Mapping) else str(config)
+    keys = _extended(dict(config), where) if isinstance(config, Mapping) else _read(config)
+    built: Config = _build(Config, keys, where, ())
+    if not built.stages:
+        raise ConfigError("nothing to do", where=f"{where}: stages", got="no stage", expected="at least one")
+    return built
 
 
 def _read(config: str | Path) -> dict[str, Any]:

@@ -12,7 +12,7 @@ from torchstickcal.problem import Measurements, State
 _CUT = 4.0
 _ROUNDS = 5
 _MEDIAN_CHI2_2 = 2 * math.log(2)
-_MIN_SIGMA_PX = 1e-3
+_MIN_SIGMA_PX = 1e-4
 _MIN_ACCELERATION_M = 1e-5
 _DISCERNIBLE_SHARE = 0.01
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 from torch import Tensor
 
@@ -34,11 +35,15 @@ class StageRecord:
 
 @dataclass(frozen=True)
 class Ruler:
-    """A known length: the mean distance over the session between the means of two groups of points."""
+    """A known length: the mean distance over the session between the means of two groups of points.
+
+    A rigid one has the same length in every frame, so that frames in which it has another are wrong.
+    """
 
     start: tuple[int, ...]
     end: tuple[int, ...]
     length_m: float
+    rigid: bool
 
     def lengths_m(self, measurements: Measurements, points: Tensor) -> Tensor:
         """Its length in the frames (K,) in which all its points are known, of points (3, N)."""
@@ -58,9 +63,9 @@ def rulers(observations: Observations, config: Config) -> list[Ruler]:
     """
     if config.scale is not None:
         start, end = (tuple(map(observations.point_index, names)) for names in (config.scale.start, config.scale.end))
-        return [Ruler(start, end, config.scale.length_m)]
+        return [Ruler(start, end, config.scale.length_m, rigid=False)]
     if observations.sticks and config.points != "joints":
-        return [Ruler((stick.start,), (stick.end,), stick.length_m) for stick in observations.sticks]
+        return [Ruler((stick.start,), (stick.end,), stick.length_m, rigid=True) for stick in observations.sticks]
     raise ConfigError(
         "nothing sets the scale",
         where="scale",
@@ -70,15 +75,25 @@ def rulers(observations: Observations, config: Config) -> list[Ruler]:
 
 
 def scale_factor(measurements: Measurements, points: Tensor, known: Sequence[Ruler]) -> float:
-    """The paper's stage 2: known over mean reconstructed length, frames far from the median left out."""
+    """The paper's stage 2: known over mean reconstructed length; a rigid ruler's outlying frames are left out."""
     measured, expected = 0.0, 0.0
     for ruler in known:
         lengths = ruler.lengths_m(measurements, points)
-        deviation = (lengths - lengths.median()).abs()
-        kept = lengths[deviation <= _OUTLIER_CUT * _MAD_TO_SIGMA * deviation.median() + 1e-12 * lengths.median()]
-        measured += float(kept.sum())
-        expected += ruler.length_m * len(kept)
+        if ruler.rigid:
+            deviation = (lengths - lengths.median()).abs()
+            lengths = lengths[deviation <= _OUTLIER_CUT * _MAD_TO_SIGMA * deviation.median() + 1e-12 * lengths.median()]
+        measured += float(lengths.sum())
+        expected += ruler.length_m * len(lengths)
     return expected / measured
+
+
+class StageResult(NamedTuple):
+    """Where a stage ended: the state, the measurements that took part, their noise (P,) before it, and its record."""
+
+    state: State
+    measurements: Measurements
+    sigma_px: Tensor
+    record: StageRecord
 
 
 def run_stage(
@@ -89,8 +104,8 @@ def run_stage(
     known: Sequence[Ruler],
     solver_name: str,
     listener: Listener,
-) -> tuple[State, Measurements, StageRecord]:
-    """Run one stage from a state; returns the new state, the measurements that took part and the record."""
+) -> StageResult:
+    """Run one stage from a state."""
     began = time.perf_counter()
     sigma_px = estimate_sigma_px(measurements, state)
     if stage.reject_sigmas is not None:
@@ -107,7 +122,8 @@ def run_stage(
     state = outcome.state
     if stage.rescale:
         state = state.scaled(scale_factor(measurements, state.points, known))
-    return state, measurements, StageRecord(name, outcome.stop, time.perf_counter() - began, outcome.iterations)
+    record = StageRecord(name, outcome.stop, time.perf_counter() - began, outcome.iterations)
+    return StageResult(state, measurements, sigma_px, record)
 
 
 def _agreeing(measurements: Measurements, state: State, limit_px: Tensor) -> Tensor:

@@ -9,9 +9,12 @@ from torchstickcal.problem import State
 from torchstickcal.solvers.base import IterationRecord, Listener, Outcome, Stop, Termination
 from torchstickcal.solvers.normal_equations import NormalEquations, Step, linearise
 
-_INITIAL_DAMPING = 1e-4
-_MIN_DAMPING = 1e-10
+_INITIAL_DAMPING = 1e-5
+_MIN_DAMPING = 1e-14
 _MAX_DAMPING = 1e8
+_LOOSEN = 0.03
+_SHORT_LEASH = 0.5
+_NOTHING = 0.01
 _EXACT_COST_PER_KEYPOINT = 1e-18
 
 
@@ -45,13 +48,14 @@ def gauss_newton(
         if isinstance(move, Stop):
             stop = move
             break
-        state, damping, step_m = move.state, move.damping, _largest_movement(move.step)
-        if move.decrease <= termination.cost_tolerance * system.cost:
-            stop = Stop.COST
-            break
-        if move.step.camera_sigmas <= termination.camera_tolerance:
-            stop = Stop.CAMERAS
-            break
+        state, damping, step_m = move.state, move.next_damping, _largest_movement(move.step)
+        if move.step.leash < _SHORT_LEASH:
+            if move.decrease <= termination.cost_tolerance * system.cost:
+                stop = Stop.COST
+                break
+            if move.step.camera_sigmas <= termination.camera_tolerance:
+                stop = Stop.CAMERAS
+                break
         system = linearise(objective, state, cameras_free)
     return Outcome(state, stop, tuple(records))
 
@@ -62,26 +66,34 @@ class _Move(NamedTuple):
     state: State
     step: Step
     decrease: float
-    damping: float
+    next_damping: float
 
 
 def _descend(
     objective: Objective, state: State, system: NormalEquations, damping: float, termination: Termination
 ) -> _Move | Stop:
-    """Raise the damping until a step lowers the cost; or say why none does."""
+    """Raise the damping until a step lowers the cost, or say why none does.
+
+    A step that promises next to nothing is a sign of convergence only where it is not the damping that keeps it short.
+    """
+    refused = False
     while damping <= _MAX_DAMPING:
         step = system.step(damping)
         if step is not None:
-            if step.predicted_decrease <= 0.01 * termination.cost_tolerance * system.cost:
-                return Stop.COST
+            if step.predicted_decrease <= _NOTHING * termination.cost_tolerance * system.cost:
+                if refused or step.leash < _SHORT_LEASH or damping <= _MIN_DAMPING:
+                    return Stop.COST
+                damping = max(damping * _LOOSEN, _MIN_DAMPING)
+                continue
             candidate = state.retracted(step.cameras, step.points) if len(step.cameras) else state.moved(step.points)
             decrease = system.cost - objective.cost(candidate)
             if decrease > 0:
                 agreement = decrease / step.predicted_decrease
-                shrink = 0.1 if agreement > 0.75 else 1.0 if agreement > 0.25 else 4.0
-                return _Move(candidate, step, decrease, max(damping * shrink, _MIN_DAMPING))
+                factor = _LOOSEN if agreement > 0.75 else 1.0 if agreement > 0.25 else 4.0
+                return _Move(candidate, step, decrease, max(damping * factor, _MIN_DAMPING))
             if step.predicted_decrease <= termination.cost_tolerance * system.cost:
                 return Stop.COST
+        refused = True
         damping = max(damping, 1e-8) * 10
     return Stop.DIVERGED
 

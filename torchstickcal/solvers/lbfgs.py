@@ -1,7 +1,8 @@
 """torch.optim.LBFGS on the same objective, through autograd.
 
-The unknowns are scaled by Cholesky factors of the Gauss-Newton system, of each point's block and of the reduced
-camera system, so that a unit of each changes the cost by about the same: without it the method needs thousands of iterations.
+The unknowns are scaled by Cholesky factors of the Gauss-Newton system, of each point's block and of the reduced camera
+system, and the points follow the cameras as that system has them do. Without it the method needs thousands of iterations,
+and stalls where only the sum of all points sees a direction, as it is with the scale.
 """
 
 from __future__ import annotations
@@ -28,6 +29,7 @@ class _ScaledUnknowns:
         hessian[[0, 3, 5]] *= 1 + _DAMPING
         self._points = PointElimination(hessian, None)
         self._cameras = torch.linalg.cholesky(system.reduced_system(_DAMPING)[0]).mT
+        self._response = system.response(_DAMPING).flatten(1).mT
         self._extrinsics = Extrinsics(start.rotations, start.translations)
         self._start = start
         self.camera = start.points.new_zeros(len(self._cameras), 1).requires_grad_()
@@ -38,8 +40,9 @@ class _ScaledUnknowns:
         points = self._start.points + self._points.back_solve(self.point)
         if not self.camera.numel():
             return State(self._start.rotations, self._start.translations, points)
-        tangents = torch.linalg.solve_triangular(self._cameras, self.camera, upper=True).view(-1, 6)
-        rotations, translations = self._extrinsics.compose(tangents)
+        tangents = torch.linalg.solve_triangular(self._cameras, self.camera, upper=True)
+        rotations, translations = self._extrinsics.compose(tangents.view(-1, 6))
+        points = points + (self._response @ tangents).view_as(points)
         return State(
             torch.cat([self._start.rotations[:1], rotations]), torch.cat([self._start.translations[:1], translations]), points
         )

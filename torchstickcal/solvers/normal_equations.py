@@ -31,6 +31,8 @@ class Step(NamedTuple):
     points: Tensor
     """(3, N), metres"""
     predicted_decrease: float
+    leash: float
+    """share of the descent that damping holds back, 0 to 1: near 1 the step is short because it is damped"""
     camera_sigmas: float
     """length of the cameras' step in standard deviations of their estimate; infinite where they are held"""
 
@@ -85,11 +87,17 @@ class NormalEquations:
             carried = _symmetric_times(self.cross[:, :, columns], moved).sum(0)
             point_step[:, columns] = -elimination.solve(self.point_gradient[:, columns] + carried)
         diagonal = self.point_hessian[[0, 3, 5]]
-        decrease = -float((self.camera_gradient * camera_step).sum() + (self.point_gradient * point_step).sum())
+        descent = -float((self.camera_gradient * camera_step).sum() + (self.point_gradient * point_step).sum())
         camera_diagonal = self.camera_hessian.diagonal(dim1=1, dim2=2)
-        decrease += damping * float((camera_diagonal * camera_step**2).sum() + (diagonal * point_step**2).sum())
+        held = damping * float((camera_diagonal * camera_step**2).sum() + (diagonal * point_step**2).sum())
         squared_sigmas = -float((rhs * camera_step.flatten()).sum()) if rhs.numel() else math.inf
-        return Step(camera_step, point_step, decrease, math.sqrt(max(squared_sigmas, 0.0)))
+        return Step(
+            cameras=camera_step,
+            points=point_step,
+            predicted_decrease=descent + held,
+            leash=held / max(descent, 1e-300),
+            camera_sigmas=math.sqrt(max(squared_sigmas, 0.0)),
+        )
 
     def point_variance(self) -> Tensor:
         """Mean variance along the axes of each point (N,), cameras known, stick ends taken singly, square metres."""
@@ -116,6 +124,16 @@ class NormalEquations:
         """The reduced camera system: S (6 C', 6 C') and its right-hand side's negative (6 C',)."""
         reduced, rhs, _ = self._reduce(damping)
         return reduced, rhs
+
+    def response(self, damping: float) -> Tensor:
+        """How the points follow the cameras: ``-H_xx^-1 H_xc`` as (6 C', 3, N), a step of the points per unit of tangent."""
+        response = self.points.new_empty(6 * self.camera_hessian.shape[0], *self.points.shape)
+        for columns in self._slices():
+            elimination = self._eliminate(columns, damping)
+            rows = _times_b(self.cross[:, :, columns], self.points[:, columns]).flatten(0, 1)
+            for row, solved in zip(rows, response[..., columns], strict=True):
+                solved.copy_(-elimination.solve(row))
+        return response
 
     def _reduce(self, damping: float) -> tuple[Tensor, Tensor, list[tuple[slice, PointElimination | TrackElimination]]]:
         count = self.camera_hessian.shape[0]

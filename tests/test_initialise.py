@@ -1,0 +1,86 @@
+"""The first estimate: pairs, tree, twisted poses, triangulation."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from torchstickcal import Observations, RigError, calibrate, metrics
+from torchstickcal.config import InitialiseSettings
+from torchstickcal.initialise import initialise
+from torchstickcal.initialise.graph import Edge, propagate, spanning_tree
+from torchstickcal.initialise.pairs import Pair, RelativePose, relative_poses
+from torchstickcal.initialise.triangulate import triangulate
+from torchstickcal.problem import Measurements
+from torchstickcal.simulate import Noise, golf_session
+
+
+@pytest.mark.parametrize("cameras", [2, 3, 5])
+def test_rig_comes_back_up_to_scale(cameras: int):
+    observations, truth = golf_session(cameras=cameras, frames=40, noise=Noise(0.5, missing=0.1, outliers=0.05))
+    state = initialise(Measurements.of(observations), InitialiseSettings(), [str(k) for k in range(cameras)])
+    relative = truth.rotations @ truth.rotations[0].mT
+    assert metrics.rotation_angle(state.rotations @ relative.mT).rad2deg().max() < 1.5
+    assert torch.equal(state.rotations[0], torch.eye(3, dtype=torch.float64))
+    centres = -(relative.mT @ (truth.translations - (relative @ truth.translations[0]))[..., None])[..., 0]
+    found = -(state.rotations.mT @ state.translations[..., None])[..., 0]
+    ratios = found[1:].norm(dim=1) / centres[1:].norm(dim=1)
+    assert (ratios.max() / ratios.min()) < 1.1
+
+
+def test_spanning_tree_takes_the_strongest_pairs():
+    pose = RelativePose(np.eye(3), np.array([0.0, 0, 1]), 1)
+    pairs = [
+        Pair(0, 1, 100, 90, (pose,)),
+        Pair(0, 2, 100, 20, (pose,)),
+        Pair(0, 3, 100, 30, (pose,)),
+        Pair(1, 2, 100, 80, (pose,)),
+        Pair(2, 3, 100, 70, (pose,)),
+    ]
+    edges = spanning_tree(pairs, ["a", "b", "c", "d"], 20)
+    assert [(edge.parent, edge.child) for edge in edges] == [(0, 1), (1, 2), (2, 3)]
+
+
+def test_cut_off_cameras_are_named_with_their_counts():
+    observations, _ = golf_session(cameras=4, frames=20)
+    keypoints = observations.keypoints.clone()
+    keypoints[:2, 10:] = torch.nan
+    keypoints[2:, :10] = torch.nan
+    apart = Observations(keypoints, observations.intrinsics, observations.sticks, camera_names=["a", "b", "c", "d"])
+    with pytest.raises(RigError, match=r"c, d cut off; a and c share 0, a and d share 0.*at least 20 common points"):
+        calibrate(apart)
+
+
+def test_a_third_view_tells_the_true_pose_from_its_twin():
+    """With the points in front of both cameras outvoted in the first pair, the rig still comes out right."""
+    observations, truth = golf_session(cameras=3, frames=30)
+    measurements = Measurements.of(observations)
+    rays = measurements.cameras.undistort(measurements.pixels.movedim(1, -1)).movedim(-1, 1).numpy()
+    visible = measurements.visible.numpy()
+    focal = measurements.cameras.focal_px.numpy()
+    pairs = relative_poses(rays, visible, focal, min_common=20, max_points=200, threshold_px=2.0)
+    edges = spanning_tree(pairs, ["0", "1", "2"], 20)
+    first = edges[0]
+    wrong_first = tuple(
+        RelativePose(pose.rotation, pose.translation, count)
+        for pose, count in zip(reversed(first.poses), (600, 500, 400, 400), strict=True)
+    )
+    rotations, _ = propagate([Edge(first.parent, first.child, wrong_first), *edges[1:]], rays, visible, scale=0.02)
+    relative = (truth.rotations @ truth.rotations[0].mT).numpy()
+    assert np.abs(rotations - relative).max() < 0.05
+
+
+def test_triangulation_is_exact_and_ignores_an_outlier():
+    observations, truth = golf_session(cameras=5, frames=4)
+    measurements = Measurements.of(observations)
+    rays = measurements.cameras.undistort(measurements.pixels.movedim(1, -1)).movedim(-1, 1)
+    expected = truth.points.flatten(0, 1).mT
+    weights = measurements.confidence.clone()
+    found = triangulate(truth.rotations, truth.translations, rays, weights, scale=0.01)
+    torch.testing.assert_close(found, expected, rtol=0, atol=1e-10)
+    rays[2, :, 7] += 0.2
+    found = triangulate(truth.rotations, truth.translations, rays, weights, scale=0.01, iterations=20)
+    assert (found - expected)[:, 7].norm() < 0.01
+    weights[1:, 3] = 0
+    assert triangulate(truth.rotations, truth.translations, rays, weights, scale=0.01)[:, 3].isnan().all()

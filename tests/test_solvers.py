@@ -1,0 +1,94 @@
+"""The two solvers: the same minimum, honest reasons for stopping, never a worse state."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+from torchstickcal.losses import Cauchy, GemanMcClure, Loss, ReprojectionLoss, SmoothnessLoss, StickLengthLoss
+from torchstickcal.objective import Objective
+from torchstickcal.problem import Measurements, State
+from torchstickcal.solvers import IterationRecord, Stop, Termination, solver
+
+LOSSES: dict[str, dict[str, Loss]] = {
+    "whitened": {"reprojection": ReprojectionLoss(1.0, kernel=GemanMcClure(8.0)), "length": StickLengthLoss(0.001)},
+    "paper": {
+        "reprojection": ReprojectionLoss(1.0, kernel=Cauchy(3.0)),
+        "length": StickLengthLoss(1.0, weight=0.4),
+        "smoothness": SmoothnessLoss(1.0, weight=0.2),
+    },
+}
+TIGHT = Termination(max_iterations=200, cost_tolerance=1e-11, camera_tolerance=1e-7)
+
+
+def run(name: str, objective: Objective, state: State, termination: Termination = TIGHT, cameras_free: bool = True):
+    heard: list[IterationRecord] = []
+    outcome = solver(name)(
+        objective, state, cameras_free=cameras_free, termination=termination, stage="test", listener=heard.append
+    )
+    assert tuple(heard) == outcome.iterations
+    return outcome
+
+
+@pytest.mark.parametrize("losses", LOSSES.values(), ids=LOSSES.keys())
+def test_both_reach_the_same_minimum(disturbed: tuple[Measurements, State], losses: dict[str, Loss]):
+    measurements, state = disturbed
+    objective = Objective(measurements, losses)
+    ours, theirs = run("gauss_newton", objective, state), run("lbfgs", objective, state)
+    assert ours.stop.converged
+    assert theirs.stop.converged
+    assert ours.iterations[-1].cost == pytest.approx(theirs.iterations[-1].cost, rel=1e-8)
+    assert objective.cost(ours.state) <= ours.iterations[0].cost
+
+
+@pytest.mark.parametrize("name", ["gauss_newton", "lbfgs"])
+def test_gradient_vanishes_at_the_end(disturbed: tuple[Measurements, State], name: str):
+    measurements, state = disturbed
+    objective = Objective(measurements, LOSSES["whitened"])
+
+    def gradient(state: State) -> torch.Tensor:
+        points = measurements.by_frame(state.points).movedim(0, -1).clone().requires_grad_()
+        translations = state.translations.clone().requires_grad_()
+        torch.stack(list(objective.terms(state.rotations, translations, points).values())).sum().backward()
+        assert points.grad is not None
+        assert translations.grad is not None
+        return torch.cat([points.grad.flatten(), translations.grad[1:].flatten()]).abs().max()
+
+    assert gradient(run(name, objective, state).state) < 1e-5 * gradient(state)
+
+
+@pytest.mark.parametrize("name", ["gauss_newton", "lbfgs"])
+def test_held_cameras_stay(disturbed: tuple[Measurements, State], name: str):
+    measurements, state = disturbed
+    outcome = run(name, Objective(measurements, LOSSES["whitened"]), state, cameras_free=False)
+    assert outcome.stop.converged
+    assert torch.equal(outcome.state.translations, state.translations)
+    assert torch.equal(outcome.state.rotations, state.rotations)
+    assert outcome.iterations[-1].cost < outcome.iterations[0].cost
+
+
+def test_cost_never_rises_and_terms_add_up(disturbed: tuple[Measurements, State]):
+    measurements, state = disturbed
+    records = run("gauss_newton", Objective(measurements, LOSSES["paper"]), state).iterations
+    costs = [record.cost for record in records]
+    assert costs == sorted(costs, reverse=True)
+    for record in records:
+        assert sum(record.terms.values()) == pytest.approx(record.cost)
+        assert len(record.reprojection_px) == 4
+
+
+@pytest.mark.parametrize("name", ["gauss_newton", "lbfgs"])
+def test_limit_of_iterations_is_reported(disturbed: tuple[Measurements, State], name: str):
+    measurements, state = disturbed
+    outcome = run(name, Objective(measurements, LOSSES["whitened"]), state, Termination(max_iterations=1, cost_tolerance=1e-15))
+    assert outcome.stop is Stop.ITERATIONS
+    assert not outcome.stop.converged
+    assert [record.iteration for record in outcome.iterations] == [0, 1]
+
+
+def test_a_hopeless_start_gives_a_status_and_the_state_it_had(disturbed: tuple[Measurements, State]):
+    measurements, state = disturbed
+    broken = State(state.rotations, state.translations, torch.full_like(state.points, torch.nan))
+    outcome = run("gauss_newton", Objective(measurements, LOSSES["whitened"]), broken)
+    assert outcome.stop is Stop.DIVERGED
+    assert torch.equal(outcome.state.translations, state.translations)

@@ -1,0 +1,77 @@
+"""Putting the result of a calibration together from its stages, in the caller's dtype and shapes."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import torch
+from torch import Tensor
+
+from torchstickcal.losses import reprojection_residuals
+from torchstickcal.observations import Observations
+from torchstickcal.problem import Measurements
+from torchstickcal.result import Calibration
+from torchstickcal.stages import StageResult
+
+_USELESS_FOCAL_SHARE = 0.03
+
+
+def assemble(
+    observations: Observations, measurements: Measurements, stages: Sequence[StageResult], seconds: Mapping[str, float]
+) -> Calibration:
+    """The calibration that the last of the stages has reached.
+
+    Args:
+        observations: as the user gave them.
+        measurements: all that could take part.
+        stages: what the stages ended with, in order.
+        seconds: time by step.
+    """
+    state, used, sigma_px = stages[-1].state, stages[-1].measurements, stages[-1].sigma_px
+    points = used.by_frame(state.points.where(used.active, torch.nan)).movedim(0, -1)
+    compared = (observations.visible & points.isfinite().all(-1))[..., None]
+    residuals = reprojection_residuals(
+        points, state.rotations, state.translations, observations.keypoints.double(), measurements.cameras
+    ).where(compared, torch.nan)
+    starts, ends = [stick.start for stick in observations.sticks], [stick.end for stick in observations.sticks]
+    distortion, size, cameras = observations.distortion, observations.image_size, observations.num_cameras
+
+    def as_given(tensor: Tensor) -> Tensor:
+        return tensor.to(observations.keypoints.dtype).contiguous()
+
+    return Calibration(
+        rotations=as_given(state.rotations),
+        translations=as_given(state.translations),
+        points=as_given(points),
+        residuals_px=as_given(residuals),
+        inliers=used.by_frame(used.visible),
+        stick_lengths_m=as_given((points[:, ends] - points[:, starts]).norm(dim=-1)),
+        sigma_px=as_given(sigma_px),
+        intrinsics=as_given(observations.cameras.matrix),
+        distortion=None if distortion is None else as_given(distortion.expand(cameras, distortion.shape[-1])),
+        image_size=None if size is None else size.expand(cameras, 2).round().long().contiguous(),
+        fisheye=observations.fisheye,
+        sticks=observations.sticks,
+        fps=observations.fps,
+        point_names=observations.point_names,
+        camera_names=tuple(observations.camera_label(index) for index in range(cameras)),
+        stages=tuple(stage.record for stage in stages),
+        seconds=dict(seconds),
+        warnings=_warnings(observations, measurements, used, sigma_px),
+    )
+
+
+def _warnings(observations: Observations, measurements: Measurements, used: Measurements, sigma_px: Tensor) -> tuple[str, ...]:
+    found: list[str] = []
+    comparable, kept = int(measurements.visible.sum()), int(used.visible.sum())
+    seen = int(observations.visible[:, :, measurements.by_frame(measurements.active).any(0)].sum())
+    if seen > comparable:
+        found.append(f"{seen - comparable} of {seen} keypoints took no part: no second camera saw the point.")
+    if comparable > kept:
+        share = (comparable - kept) / comparable
+        found.append(f"{comparable - kept} of {comparable} keypoints ({share:.1%}) contradict the rest and were set aside.")
+    noisy = (sigma_px > _USELESS_FOCAL_SHARE * measurements.cameras.focal_px.mean()).nonzero().flatten().tolist()
+    if noisy:
+        names = ", ".join(observations.point_label(point) for point in noisy)
+        found.append(f"too noisy to be of use (their 3D points are not reliable): {names}.")
+    return tuple(found)
