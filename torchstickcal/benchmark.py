@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -41,20 +40,22 @@ def session_files(folder: Path) -> list[Path]:
     return files
 
 
-def score_sequences(files: list[Path], config: Config) -> Iterator[SequenceScore]:
-    """Calibrate session after session and compare with the truth; sessions without a truth are passed over."""
-    for path in files:
-        observations, truth = read_session(path)
-        if truth is None:
-            continue
-        try:
-            calibration = calibrate(observations, config)
-        except CalibrationError as error:
-            yield SequenceScore(path.stem, None, None, 0.0, f"{type(error).__name__}: {error}")
-            continue
-        errors = pose_errors(calibration.rotations, calibration.translations, truth.rotations, truth.translations)
-        seconds = calibration.seconds["total"]
-        yield SequenceScore(path.stem, errors.mean_rotation_deg, errors.mean_translation_m, seconds, calibration.status)
+def score_sequence(path: Path, config: Config) -> SequenceScore | None:
+    """Calibrate a session and compare with its truth; None if it carries none.
+
+    Raises:
+        CalibrationError: if the file is not a usable session.
+    """
+    observations, truth = read_session(path)
+    if truth is None:
+        return None
+    try:
+        calibration = calibrate(observations, config)
+    except CalibrationError as error:
+        return SequenceScore(path.stem, None, None, 0.0, f"{type(error).__name__}: {error}")
+    errors = pose_errors(calibration.rotations, calibration.translations, truth.rotations, truth.translations)
+    seconds = calibration.seconds["total"]
+    return SequenceScore(path.stem, errors.mean_rotation_deg, errors.mean_translation_m, seconds, calibration.status)
 
 
 def summarise(scores: list[SequenceScore]) -> dict[str, Any]:

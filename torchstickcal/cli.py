@@ -120,7 +120,7 @@ def _evaluate(options: argparse.Namespace) -> int:
 
 
 def _benchmark(options: argparse.Namespace) -> int:
-    from torchstickcal.benchmark import score_sequences, session_files, summarise
+    from torchstickcal.benchmark import score_sequence, session_files, summarise
     from torchstickcal.config import load_config
 
     config = load_config(options.config)
@@ -128,7 +128,11 @@ def _benchmark(options: argparse.Namespace) -> int:
     width = max(len(file.stem) for file in files)
     scores = []
     print(f"{'session':{width}}  rotation (deg)  translation (mm)  time (ms)  status")
-    for score in score_sequences(files, config):
+    for file in files:
+        score = score_sequence(file, config)
+        if score is None:
+            print(f"{file.stem} passed over: it carries no truth", file=sys.stderr)
+            continue
         scores.append(score)
         rotation = "-" if score.rotation_deg is None else f"{score.rotation_deg:.5f}"
         translation = "-" if score.translation_m is None else f"{1000 * score.translation_m:.3f}"

@@ -194,8 +194,8 @@ def _build(kind: Any, value: Any, where: str, path: tuple[str, ...]) -> Any:
             return None
         options = [option for option in arguments if option is not type(None)]
         matching = [option for option in options if _fits(option, value)]
-        if matching or len(options) == 1:
-            return _build((matching or options)[0], value, where, path)
+        if matching:
+            return _build(matching[0], value, where, path)
     elif origin is dict and isinstance(value, dict):
         return {key: _build(arguments[1], item, where, (*path, key)) for key, item in value.items()}
     elif origin is list and isinstance(value, list):
@@ -231,6 +231,8 @@ def _build_dataclass(kind: type, value: Any, where: str, path: tuple[str, ...]) 
 def _fits(kind: Any, value: Any) -> bool:
     if typing.get_origin(kind) is Literal:
         return isinstance(value, str) and value in typing.get_args(kind)
+    if dataclasses.is_dataclass(kind):
+        return isinstance(value, dict)
     if kind is float:
         return isinstance(value, int | float) and not isinstance(value, bool) and 0 < value < math.inf
     if kind is int:

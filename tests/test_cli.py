@@ -1,0 +1,128 @@
+"""The command line as a user meets it."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from torchstickcal import Calibration
+from torchstickcal.cli import main
+from torchstickcal.io import read_camera_toml, write_npz
+from torchstickcal.simulate import Noise, golf_session
+
+
+@pytest.fixture
+def session(tmp_path: Path) -> Path:
+    path = tmp_path / "swing.npz"
+    write_npz(path, *golf_session(cameras=3, frames=30, noise=Noise(0.5)))
+    return path
+
+
+def test_calibrate_then_evaluate(session: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    out = tmp_path / "results"
+    assert main(["calibrate", str(session), "--out", str(out)]) == 0
+    shown = capsys.readouterr().out
+    for word in ("cam01", "centre", "reprojection", "keypoints", "club_grip - club_head", "initialise", "total"):
+        assert word in shown
+    assert sorted(file.name for file in out.iterdir()) == ["calibration.toml", "points.npz", "report.json"]
+    report = json.loads((out / "report.json").read_text())
+    assert report["converged"] is True
+    assert [camera["name"] for camera in report["cameras"]] == ["cam01", "cam02", "cam03"]
+    calibration = Calibration.load(out / "points.npz")
+    assert read_camera_toml(out / "calibration.toml").translations.tolist() == calibration.translations.tolist()
+
+    assert main(["evaluate", str(out), str(session), "--json", str(tmp_path / "e.json")]) == 0
+    errors = json.loads((tmp_path / "e.json").read_text())
+    assert errors["mean_translation_m"] < 5e-3
+    assert len(errors["cameras"]) == 3
+    assert "mean" in capsys.readouterr().out
+    assert main(["evaluate", str(out), str(out)]) == 0
+
+
+def test_stick_length_scales_the_rig(session: Path, tmp_path: Path):
+    for length in ("1.0", "2.0"):
+        main(["calibrate", str(session), "--out", str(tmp_path / length), "--stick-length", length])
+    one, two = (Calibration.load(tmp_path / length / "points.npz").translations for length in ("1.0", "2.0"))
+    assert (2 * one - two).abs().max() < 0.02
+
+
+def test_tensorboard_log(session: Path, tmp_path: Path):
+    main(["calibrate", str(session), "--out", str(tmp_path / "out"), "--tensorboard", str(tmp_path / "log")])
+    assert len(list((tmp_path / "log").iterdir())) == 1
+
+
+def test_benchmark(session: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    folder = tmp_path / "sessions"
+    folder.mkdir()
+    session.rename(folder / session.name)
+    observations, _ = golf_session(cameras=3, frames=30)
+    write_npz(folder / "no_truth.npz", observations)
+    assert main(["benchmark", str(folder), "--json", str(tmp_path / "b.json"), "--config", "paper"]) == 0
+    scores = json.loads((tmp_path / "b.json").read_text())
+    assert [sequence["name"] for sequence in scores["sequences"]] == ["swing"]
+    assert scores["sequences"][0].keys() == {"name", "rotation_deg", "translation_m", "seconds", "status"}
+    assert scores["mean_translation_m"] == scores["sequences"][0]["translation_m"] < 0.05
+    shown = capsys.readouterr()
+    assert "1 of 1 converged" in shown.out
+    assert "no_truth" in shown.err
+
+
+def test_demo(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    assert main(["demo", "--out", str(tmp_path / "demo")]) == 0
+    shown = capsys.readouterr().out
+    assert "Against the truth" in shown
+    assert (tmp_path / "demo" / "rig.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_the_same_command_writes_the_same_cameras(session: Path, tmp_path: Path):
+    for name in ("a", "b"):
+        main(["calibrate", str(session), "--out", str(tmp_path / name)])
+    assert (tmp_path / "a" / "calibration.toml").read_bytes() == (tmp_path / "b" / "calibration.toml").read_bytes()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["calibrate", "absent.npz", "--out", "out"], "No such file"),
+        (["calibrate", "SESSION", "--out", "out", "--config", "papr"], "Did you mean 'paper'"),
+        (["calibrate", "SESSION", "--out", "out", "--stick-length", "1150"], "millimetres"),
+        (["evaluate", "SESSION", "FOUR"], "number of cameras differs"),
+        (["benchmark", "EMPTY"], "no sessions"),
+    ],
+)
+def test_errors_are_one_line_and_leave_nothing(
+    arguments: list[str], message: str, session: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch
+):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "empty").mkdir()
+    write_npz(tmp_path / "four.npz", *golf_session(cameras=4, frames=5))
+    places = {"SESSION": str(session), "FOUR": "four.npz", "EMPTY": "empty"}
+    assert main([places.get(argument, argument) for argument in arguments]) == 2
+    error = capsys.readouterr().err
+    assert error.startswith("error: ")
+    assert message in error
+    assert error.count("\n") == 1
+    assert not (tmp_path / "out").exists()
+
+
+def test_help_and_usage_errors_do_not_wait_for_torch():
+    code = (
+        "import sys\nfrom torchstickcal.cli import main\n"
+        "for arguments in (['--help'], ['calibrate', '--help'], ['nonsense']):\n"
+        "    try:\n        main(arguments)\n    except SystemExit:\n        pass\n"
+        "assert not {'torch', 'numpy', 'kornia', 'cv2', 'matplotlib'} & set(sys.modules)"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True, capture_output=True)
+
+
+def test_calibrating_imports_neither_kornia_nor_tensorboard():
+    code = (
+        "import sys, torchstickcal\nfrom torchstickcal.simulate import golf_session\n"
+        "torchstickcal.calibrate(golf_session(cameras=3, frames=10)[0])\n"
+        "assert not {'kornia', 'tensorboard', 'matplotlib'} & set(sys.modules)"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True, capture_output=True)
