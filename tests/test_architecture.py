@@ -19,7 +19,7 @@ LAYERS = [
     ["initialise", "stages"],
     ["result"],
     ["assemble"],
-    ["calibrate", "metrics", "report", "figures"],
+    ["pipeline", "metrics", "report", "figures"],
     ["io"],
     ["simulate", "benchmark", "monitor"],
     ["cli"],
@@ -60,3 +60,11 @@ def test_every_public_name_can_be_imported():
         assert getattr(torchstickcal, name).__doc__
     with pytest.raises(AttributeError, match="no attribute 'calibrat'"):
         _ = torchstickcal.calibrat
+
+
+def test_public_names_do_not_hide_behind_modules_of_the_same_name():
+    """A module that is imported becomes an attribute of its package and would take such a name's place."""
+    import torchstickcal
+
+    modules = {path.stem for path in (ROOT / "torchstickcal").iterdir()}
+    assert not modules & set(torchstickcal.__all__)

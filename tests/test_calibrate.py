@@ -54,6 +54,21 @@ def test_without_a_stick_or_a_length_nothing_sets_the_scale(perfect):
         calibrate(dataclasses.replace(observations, sticks=()))
 
 
+def test_a_segment_never_seen_whole_sets_no_scale(noisy):
+    observations, _ = noisy
+    keypoints = observations.keypoints.clone()
+    keypoints[:, :, observations.point_names.index("head_top")] = torch.nan
+    with pytest.raises(ObservationError, match="never seen whole"):
+        calibrate(dataclasses.replace(observations, keypoints=keypoints), "human_only")
+
+
+@pytest.mark.parametrize("frames", [1, 2, 3])
+def test_few_frames_suffice(frames: int):
+    observations, truth = golf_session(cameras=4, frames=60)
+    few = dataclasses.replace(observations, keypoints=observations.keypoints[:, 20 : 20 + frames])
+    assert errors(calibrate(few), truth).translation_m.max() < 1e-8
+
+
 def test_noise_gaps_and_outliers():
     clean, truth = golf_session(cameras=6, frames=120, noise=Noise(1.5))
     baseline = errors(calibrate(clean), truth).mean_translation_m

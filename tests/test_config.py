@@ -70,7 +70,7 @@ def test_files_that_are_not_toml_or_empty_are_refused(tmp_path: Path):
     with pytest.raises(ConfigError, match="nothing to do"):
         load_config(file)
     file.write_text("")
-    with pytest.raises(ConfigError, match="missing key.*stages"):
+    with pytest.raises(ConfigError, match=r"missing key.*stages"):
         load_config(file)
     with pytest.raises(ConfigError, match="unknown configuration"):
         load_config(tmp_path / "absent.toml")

@@ -84,7 +84,7 @@ def test_damaged_pickles_are_refused(tmp_path: Path):
     with pytest.raises(FileFormatError, match="damaged"):
         read_sports_stick_syn(path)
     path.write_bytes(pickle.dumps({"K": 1}))
-    with pytest.raises(FileFormatError, match="not a usable session.*all_pose_projections_2d"):
+    with pytest.raises(FileFormatError, match=r"not a usable session.*all_pose_projections_2d"):
         read_sports_stick_syn(path)
     path.write_bytes(pickle.dumps([1, 2]))
     with pytest.raises(FileFormatError, match="not a usable session"):
@@ -116,7 +116,7 @@ def test_npz_round_trip(tmp_path: Path, noisy):
 
 def test_npz_without_its_arrays_is_refused(tmp_path: Path):
     np.savez(tmp_path / "a.npz", keypoints=np.zeros((2, 3, 4, 2)))
-    with pytest.raises(FileFormatError, match="not a usable session.*stick_start"):
+    with pytest.raises(FileFormatError, match=r"not a usable session.*stick_start"):
         read_npz(tmp_path / "a.npz")
     (tmp_path / "b.npz").write_bytes(b"PK\x03\x04 nonsense")
     with pytest.raises(FileFormatError, match="not a usable session"):

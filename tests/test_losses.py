@@ -122,13 +122,16 @@ def test_reprojection_linearised(kernel):
     torch.testing.assert_close(loss.cost(points_cam, pixels, information, s["intrinsics"]), value)
 
     repeated = s["points"].expand(C, F, P, 3).clone().requires_grad_()
-    residuals = torch.stack(
+    lenses = s["intrinsics"]
+    by_camera = zip(s["rotations"], s["translations"], s["keypoints"], lenses.matrix, lenses.distortion, strict=True)
+    residuals = torch.cat(
         [
-            reprojection_residuals(repeated[c], s["rotations"][c : c + 1], s["translations"][c : c + 1], s["keypoints"][c : c + 1],
-                                   Intrinsics(s["intrinsics"].matrix[c : c + 1], s["intrinsics"].distortion[c : c + 1]))[0]
-            for c in range(C)
+            reprojection_residuals(
+                points, rotation[None], translation[None], pixels[None], Intrinsics(matrix[None], lens[None])
+            )
+            for points, (rotation, translation, pixels, matrix, lens) in zip(repeated, by_camera, strict=True)
         ]
-    )  # fmt: skip
+    )
     rows = torch.stack([torch.autograd.grad(residuals[..., k].sum(), repeated, retain_graph=True)[0] for k in (0, 1)], dim=-2)
     whitened = residuals.detach().square().sum(-1) * s["confidence"] / sigma**2
     weights = 0.7 * kernel.weight(whitened) * torch.where(seen, s["confidence"], 0.0) / sigma**2

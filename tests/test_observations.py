@@ -71,6 +71,7 @@ def test_bad_input_is_refused(changes: dict[str, Any], message: str):
         ((0, 1, -1.0), "not a length"),
         ((0, 1, float("nan")), "not a length"),
         ((0, 1, 1150.0), r"millimetres.*Divide by 1000: 1.15 m"),
+        ((0, 1, 86.0), r"centimetres.*Divide by 100: 0.86 m"),
     ],
 )
 def test_bad_sticks_are_refused(values: tuple[int, int, float], message: str):

@@ -13,13 +13,13 @@ from importlib.metadata import version
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from torchstickcal.calibrate import Callback, calibrate
     from torchstickcal.cameras import Intrinsics
     from torchstickcal.config import Config, config_names, load_config
     from torchstickcal.errors import CalibrationError, ConfigError, FileFormatError, ObservationError, RigError
     from torchstickcal.extrinsics import Extrinsics
     from torchstickcal.monitor import TensorBoardMonitor
     from torchstickcal.observations import Observations, Stick
+    from torchstickcal.pipeline import Callback, calibrate
     from torchstickcal.result import Calibration
 
 __version__ = version("torchstickcal")
@@ -27,7 +27,7 @@ __version__ = version("torchstickcal")
 _HOMES = {
     "Calibration": "result",
     "CalibrationError": "errors",
-    "Callback": "calibrate",
+    "Callback": "pipeline",
     "Config": "config",
     "ConfigError": "errors",
     "Extrinsics": "extrinsics",
@@ -38,7 +38,7 @@ _HOMES = {
     "RigError": "errors",
     "Stick": "observations",
     "TensorBoardMonitor": "monitor",
-    "calibrate": "calibrate",
+    "calibrate": "pipeline",
     "config_names": "config",
     "load_config": "config",
 }

@@ -8,11 +8,11 @@ from typing import Any
 
 import torch
 
-from torchstickcal.calibrate import calibrate
 from torchstickcal.config import Config
 from torchstickcal.errors import CalibrationError, FileFormatError
 from torchstickcal.io import read_session
 from torchstickcal.metrics import pose_errors
+from torchstickcal.pipeline import calibrate
 
 _SUFFIXES = {".npz", ".pkl"}
 

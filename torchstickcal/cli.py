@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING, Any
 from torchstickcal.errors import CalibrationError
 
 if TYPE_CHECKING:
-    from torchstickcal.calibrate import Callback
     from torchstickcal.io import Truth
+    from torchstickcal.pipeline import Callback
     from torchstickcal.result import Calibration
     from torchstickcal.solvers import IterationRecord
 
@@ -78,9 +78,9 @@ def _add_config(command: argparse.ArgumentParser) -> None:
 
 
 def _calibrate(options: argparse.Namespace) -> int:
-    from torchstickcal.calibrate import calibrate
     from torchstickcal.config import load_config
     from torchstickcal.io import read_session
+    from torchstickcal.pipeline import calibrate
 
     config = load_config(options.config)
     observations, _ = read_session(options.session)
@@ -148,11 +148,11 @@ def _benchmark(options: argparse.Namespace) -> int:
 
 
 def _demo(options: argparse.Namespace) -> int:
-    from torchstickcal.calibrate import calibrate
     from torchstickcal.figures import rig_figure
     from torchstickcal.files import atomic_path
     from torchstickcal.io import write_npz
     from torchstickcal.metrics import pose_errors
+    from torchstickcal.pipeline import calibrate
     from torchstickcal.simulate import Noise, golf_session
 
     print(

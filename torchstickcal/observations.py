@@ -14,6 +14,7 @@ from torchstickcal.cameras import Intrinsics
 from torchstickcal.errors import ObservationError
 
 _LONGEST_STICK_M = 10.0
+_SHORTEST_IN_MM = 300.0
 
 
 @dataclass(frozen=True)
@@ -40,12 +41,13 @@ class Stick:
                 "stick length is not a length", where="Stick.length_m", got=self.length_m, expected="metres, above 0"
             )
         if self.length_m > _LONGEST_STICK_M:
+            unit, factor = ("millimetres", 1000) if self.length_m >= _SHORTEST_IN_MM else ("centimetres", 100)
             raise ObservationError(
-                "stick length looks like millimetres",
+                f"stick length looks like {unit}",
                 where="Stick.length_m",
                 got=self.length_m,
                 expected=f"metres, at most {_LONGEST_STICK_M:g}",
-                remedy=f"Divide by 1000: {self.length_m / 1000:g} m.",
+                remedy=f"Divide by {factor}: {self.length_m / factor:g} m.",
             )
 
 

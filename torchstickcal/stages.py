@@ -10,7 +10,7 @@ from typing import NamedTuple
 from torch import Tensor
 
 from torchstickcal.config import Config, Stage
-from torchstickcal.errors import ConfigError
+from torchstickcal.errors import ConfigError, ObservationError
 from torchstickcal.losses import Loss, ReprojectionLoss, SmoothnessLoss, StickLengthLoss, robust_kernel
 from torchstickcal.noise import estimate_acceleration_m, estimate_sigma_px
 from torchstickcal.objective import Objective
@@ -75,7 +75,11 @@ def rulers(observations: Observations, config: Config) -> list[Ruler]:
 
 
 def scale_factor(measurements: Measurements, points: Tensor, known: Sequence[Ruler]) -> float:
-    """The paper's stage 2: known over mean reconstructed length; a rigid ruler's outlying frames are left out."""
+    """The paper's stage 2: known over mean reconstructed length; a rigid ruler's outlying frames are left out.
+
+    Raises:
+        ObservationError: if there is no frame in which a ruler's points are all known.
+    """
     measured, expected = 0.0, 0.0
     for ruler in known:
         lengths = ruler.lengths_m(measurements, points)
@@ -84,6 +88,13 @@ def scale_factor(measurements: Measurements, points: Tensor, known: Sequence[Rul
             lengths = lengths[deviation <= _OUTLIER_CUT * _MAD_TO_SIGMA * deviation.median() + 1e-12 * lengths.median()]
         measured += float(lengths.sum())
         expected += ruler.length_m * len(lengths)
+    if not measured:
+        raise ObservationError(
+            "the length that sets the scale is never seen whole",
+            where="scale",
+            got="no frame",
+            expected="a frame in which all its points are seen by two cameras",
+        )
     return expected / measured
 
 
