@@ -96,10 +96,6 @@ class CameraPointLoss(Loss, ABC):
         """The loss of points (F, P, 3) in cameras (C, 3, 3), (C, 3) that saw keypoints (C, F, P, 2)."""
 
     @abstractmethod
-    def cost(self, points_cam: Tensor, pixels: Tensor, information: Tensor, cameras: Intrinsics) -> Tensor:
-        """The loss (); arguments as for :meth:`linearise`, without derivatives."""
-
-    @abstractmethod
     def linearise(
         self, points_cam: Tensor, rotations: Tensor, pixels: Tensor, information: Tensor, cameras: Intrinsics
     ) -> CameraPointTerms:

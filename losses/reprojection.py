@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from torchstickcal.cameras import Intrinsics
+from torchstickcal.cameras import Intrinsics, inverse_depths
 from torchstickcal.losses.base import CameraPointLoss, CameraPointTerms
 
 
@@ -53,34 +53,51 @@ class ReprojectionLoss(CameraPointLoss):
         squared = residuals.square().sum(-1) * self.information(residuals)
         return self.total(squared if confidence is None else squared * confidence)
 
-    def cost(self, points_cam: Tensor, pixels: Tensor, information: Tensor, cameras: Intrinsics) -> Tensor:
-        x, y = cameras.project_components(*points_cam.unbind(1))
-        return self.total(((x - pixels[:, 0]).square() + (y - pixels[:, 1]).square()) * information)
-
     def linearise(
         self, points_cam: Tensor, rotations: Tensor, pixels: Tensor, information: Tensor, cameras: Intrinsics
     ) -> CameraPointTerms:
-        x, y, jacobian = cameras.project_with_jacobian(*points_cam.unbind(1))
-        residual = torch.stack([x, y], dim=1).sub_(pixels)
-        squared_px = residual.square().sum(1)
+        # The derivative of (u, v) by the world point has the rows p / z and q / z, p = r1 - u r3 and q = r2 - v r3 with the
+        # rows r of the rotation; M, the derivative of the pixel by (u, v), gives J^T W J = [p q] (M^T W M / z^2) [p q]^T.
+        x, y, z = points_cam.unbind(1)
+        inverse_depth = inverse_depths(z)
+        u, v = x * inverse_depth, y * inverse_depth
+        m = cameras.pixels_with_jacobian(u, v)
+        rx, ry = m.x - pixels[:, 0], m.y - pixels[:, 1]
+        squared_px = rx.square().addcmul_(ry, ry)
         squared = squared_px * information
-        weights = self.weight * information * self.kernel.weight(squared)
-        world = rotations.mT[:, None] @ jacobian
-        weighted = world * weights[:, None, None]
+        weights = information * self.kernel.weight(squared)
+        if self.weight != 1.0:
+            weights = weights * self.weight
+
+        first, second, third = rotations[..., None].unbind(1)
+        p = torch.addcmul(first, u[:, None], third, value=-1)
+        q = torch.addcmul(second, v[:, None], third, value=-1)
+        gradient = p * _scaled(weights, m.dx_du, rx, m.dy_du, ry, inverse_depth)
+        gradient.addcmul_(q, _scaled(weights, m.dx_dv, rx, m.dy_dv, ry, inverse_depth))
+
+        weights_at_depth = weights * inverse_depth.square()
+        pq = _scaled(weights_at_depth, m.dx_du, m.dx_dv, m.dy_du, m.dy_dv)
+        s = p * _scaled(weights_at_depth, m.dx_du, m.dx_du, m.dy_du, m.dy_du)
+        t = p * pq
+        s.addcmul_(q, pq)
+        t.addcmul_(q, _scaled(weights_at_depth, m.dx_dv, m.dx_dv, m.dy_dv, m.dy_dv))
+        hessian = p.new_empty(p.shape[0], 6, p.shape[2])
+        for entries, axis in ((slice(0, 3), 0), (slice(3, 5), 1), (slice(5, 6), 2)):
+            torch.mul(p[:, axis : axis + 1], s[:, axis:], out=hessian[:, entries])
+            hessian[:, entries].addcmul_(q[:, axis : axis + 1], t[:, axis:])
         return CameraPointTerms(
             cost=self.total(squared),
             squares=(weights * squared_px).sum(1),
             weights=weights.sum(1),
-            gradient=(weighted * residual[:, :, None]).sum(1),
-            hessian=torch.cat(
-                [
-                    (weighted[:, :, :1] * world).sum(1),
-                    (weighted[:, :, 1:2] * world[:, :, 1:]).sum(1),
-                    (weighted[:, :, 2:] * world[:, :, 2:]).sum(1),
-                ],
-                dim=1,
-            ),
+            gradient=gradient,
+            hessian=hessian,
         )
+
+
+def _scaled(weights: Tensor, a: Tensor, b: Tensor, c: Tensor, d: Tensor, factor: Tensor | None = None) -> Tensor:
+    """``weights (a b + c d) factor`` as (C, 1, N)."""
+    scaled = weights * torch.addcmul(a * b, c, d)
+    return (scaled if factor is None else scaled * factor)[:, None]
 
 
 def _as_intrinsics(intrinsics: Intrinsics | Tensor, rotations: Tensor) -> Intrinsics:

@@ -9,7 +9,7 @@ import pytest
 
 ROOT = Path(__file__).parents[1]
 LAYERS = [
-    ["errors", "files"],
+    ["errors", "files", "symmetric"],
     ["se3"],
     ["cameras", "observations"],
     ["losses"],

@@ -6,7 +6,9 @@ import pytest
 import torch
 from torch import Tensor
 
-from torchstickcal.solvers.point_elimination import PointElimination, StickCoupling
+from torchstickcal import se3
+from torchstickcal.solvers.cross_blocks import cross_rows, symmetric_times
+from torchstickcal.solvers.point_elimination import PointElimination
 from torchstickcal.solvers.track_elimination import BlockTridiagonal, TrackElimination
 
 P = 5
@@ -54,32 +56,52 @@ def flat(columns: Tensor) -> Tensor:
     return columns.mT.flatten()
 
 
-def check(elimination: PointElimination | TrackElimination, dense: Tensor) -> None:
-    right = torch.randn(4, 3, dense.shape[0] // 3, dtype=torch.float64)
-    matrix = torch.stack([flat(columns) for columns in right])
-    half = elimination.half_solve(right)
-    torch.testing.assert_close(half @ half.mT, matrix @ torch.linalg.solve(dense, matrix.mT), rtol=1e-12, atol=1e-12)
-    torch.testing.assert_close(flat(elimination.solve(right[0])), torch.linalg.solve(dense, matrix[0]), rtol=1e-11, atol=1e-12)
+def check(elimination: PointElimination | TrackElimination, dense: Tensor, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Against dense algebra, for random blocks N_c of two cameras and a random gradient."""
+    count = dense.shape[0] // 3
+    cross, points, gradient = (torch.randn(*shape, count, dtype=torch.float64) for shape in ((2, 6), (3,), (3,)))
+    coupling = torch.stack([flat(row) for row in cross_rows(cross, points).flatten(0, 1)])
+    right = torch.cat([coupling, flat(gradient)[None]])
+    expected = right @ torch.linalg.solve(dense, right.mT)
+    for part in (10**6, 2 * P):
+        monkeypatch.setattr("torchstickcal.solvers.point_elimination._PART_KEYPOINTS", 2 * part)
+        gram = torch.zeros_like(expected)
+        for rows, half in elimination.reductions(cross, points, gradient):
+            both = torch.cat([rows, half[None]])
+            gram += both @ both.mT
+        torch.testing.assert_close(gram, expected, rtol=1e-11, atol=1e-11 * float(expected.abs().max()))
+    solution = torch.linalg.solve(dense, flat(gradient))
+    torch.testing.assert_close(flat(elimination.solve(gradient)), solution, rtol=1e-11, atol=1e-12)
+
+
+def test_cross_rows_are_blocks_times_the_cameras_jacobian():
+    blocks, points = torch.randn(2, 6, 7, dtype=torch.float64), torch.randn(3, 7, dtype=torch.float64)
+    matrices = blocks[:, [0, 1, 2, 1, 3, 4, 2, 4, 5]].unflatten(1, (3, 3)).movedim(-1, 1)
+    jacobian = torch.cat([torch.eye(3, dtype=torch.float64).expand(7, 3, 3), -se3.hat(points.mT)], dim=-1)
+    torch.testing.assert_close(cross_rows(blocks, points).permute(0, 3, 2, 1), matrices @ jacobian)
+    vectors = torch.randn(2, 3, 7, dtype=torch.float64)
+    expected = (matrices @ vectors.movedim(-1, 1)[..., None])[..., 0].sum(0).mT
+    torch.testing.assert_close(symmetric_times(blocks, vectors), expected)
 
 
 @pytest.mark.parametrize("frames", [2, 3, 7])
-def test_points_and_sticks(frames: int):
+def test_points_and_sticks(frames: int, monkeypatch: pytest.MonkeyPatch):
     dense, blocks, coupling, *_ = system(frames, smooth=False)
-    first = P * torch.arange(frames)[:, None]
-    starts, ends = ((first + PAIRS[:, k]).flatten() for k in (0, 1))
-    check(PointElimination(blocks.flatten(1), StickCoupling(starts, ends, coupling.flatten(1))), dense)
+    check(PointElimination(blocks, PAIRS, coupling), dense, monkeypatch)
 
 
-def test_points_alone():
+def test_points_alone(monkeypatch: pytest.MonkeyPatch):
     _, blocks, *_ = system(4, smooth=False)
     matrices = blocks.flatten(1)[[0, 1, 2, 1, 3, 4, 2, 4, 5]].mT.reshape(-1, 3, 3)
-    check(PointElimination(blocks.flatten(1), None), torch.block_diag(*matrices))
+    elimination = PointElimination(blocks, PAIRS, None)
+    check(elimination, torch.block_diag(*matrices), monkeypatch)
+    torch.testing.assert_close(elimination.variances().mT, torch.linalg.inv(matrices).diagonal(dim1=1, dim2=2))
 
 
 @pytest.mark.parametrize("frames", [3, 4, 5, 8, 11])
-def test_tracks(frames: int):
+def test_tracks(frames: int, monkeypatch: pytest.MonkeyPatch):
     dense, blocks, coupling, next_frame, second_frame = system(frames, smooth=True)
-    check(TrackElimination(blocks, PAIRS, coupling, next_frame, second_frame), dense)
+    check(TrackElimination(blocks, PAIRS, coupling, next_frame, second_frame), dense, monkeypatch)
 
 
 @pytest.mark.parametrize("count", [1, 2, 3, 6, 9])

@@ -13,7 +13,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-_MIN_DEPTH_M = 1e-6
+_MAX_INVERSE_DEPTH = 1e6
 _FOLD_SEARCH_RADIUS = 8.0
 _FOLD_SEARCH_STEPS = 4096
 _UNDISTORT_ITERATIONS = 50
@@ -28,6 +28,17 @@ class Distorted(NamedTuple):
     du_du: Tensor
     du_dv: Tensor
     dv_dv: Tensor
+
+
+class PixelMap(NamedTuple):
+    """Pixels of normalised coordinates, with derivatives; (C, N), or (C, 1) where a derivative is the same for all."""
+
+    x: Tensor
+    y: Tensor
+    dx_du: Tensor
+    dx_dv: Tensor
+    dy_du: Tensor
+    dy_dv: Tensor
 
 
 @dataclass(frozen=True)
@@ -60,32 +71,23 @@ class Intrinsics:
 
     def project_components(self, x: Tensor, y: Tensor, z: Tensor) -> tuple[Tensor, Tensor]:
         """Pixel coordinates of points given as three tensors (C, ...)."""
-        depth = _away_from_zero(z)
-        return self._to_pixels(*self.distort(x / depth, y / depth))
+        inverse_depth = inverse_depths(z)
+        return self._to_pixels(*self.distort(x * inverse_depth, y * inverse_depth))
 
-    def project_with_jacobian(self, x: Tensor, y: Tensor, z: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Pixel coordinates and their derivative by the point in the camera's frame.
-
-        Returns:
-            Two pixel coordinates (C, N), and the Jacobian's rows as (C, 2, 3, N), of points given as three tensors (C, N).
-        """
-        inverse_depth = _away_from_zero(z).reciprocal()
-        u, v = x * inverse_depth, y * inverse_depth
-        fx, skew, _, fy, _ = self._pixel_map(2)
-        jacobian = x.new_empty(x.shape[0], 2, 3, x.shape[1])
+    def pixels_with_jacobian(self, u: Tensor, v: Tensor) -> PixelMap:
+        """Pixel coordinates of normalised coordinates (C, N), with their derivatives."""
+        fx, skew, cx, fy, cy = self._pixel_map(2)
         if self.distortion is None:
-            pixel_x, pixel_y = self._to_pixels(u, v)
-            jacobian[:, 0, 0], jacobian[:, 0, 1] = fx * inverse_depth, skew * inverse_depth
-            jacobian[:, 1, 0], jacobian[:, 1, 1] = 0.0, fy * inverse_depth
-        else:
-            lens = self.distort_with_jacobian(u, v)
-            pixel_x, pixel_y = self._to_pixels(lens.u, lens.v)
-            jacobian[:, 0, 0] = (fx * lens.du_du + skew * lens.du_dv) * inverse_depth
-            jacobian[:, 0, 1] = (fx * lens.du_dv + skew * lens.dv_dv) * inverse_depth
-            jacobian[:, 1, 0] = fy * lens.du_dv * inverse_depth
-            jacobian[:, 1, 1] = fy * lens.dv_dv * inverse_depth
-        jacobian[:, :, 2] = -(jacobian[:, :, 0] * u[:, None] + jacobian[:, :, 1] * v[:, None])
-        return pixel_x, pixel_y, jacobian
+            return PixelMap(*self._to_pixels(u, v), fx, skew, torch.zeros_like(fx), fy)
+        lens = self.distort_with_jacobian(u, v)
+        return PixelMap(
+            x=fx * lens.u + skew * lens.v + cx,
+            y=fy * lens.v + cy,
+            dx_du=fx * lens.du_du + skew * lens.du_dv,
+            dx_dv=fx * lens.du_dv + skew * lens.dv_dv,
+            dy_du=fy * lens.du_dv,
+            dy_dv=fy * lens.dv_dv,
+        )
 
     def distort(self, u: Tensor, v: Tensor) -> tuple[Tensor, Tensor]:
         """Apply the lenses to normalised coordinates, two tensors (C, ...)."""
@@ -195,5 +197,6 @@ class Intrinsics:
         return limits.amin(dim=1)
 
 
-def _away_from_zero(depth: Tensor) -> Tensor:
-    return torch.where(depth.abs() < _MIN_DEPTH_M, torch.full_like(depth, _MIN_DEPTH_M), depth)
+def inverse_depths(depth: Tensor) -> Tensor:
+    """1 / z, bounded where z is nearly 0."""
+    return depth.reciprocal().clamp(-_MAX_INVERSE_DEPTH, _MAX_INVERSE_DEPTH)

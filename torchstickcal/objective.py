@@ -66,17 +66,6 @@ class Objective:
             values[name] = loss(points)
         return values
 
-    def cost(self, state: State) -> float:
-        """The value of the objective at a state."""
-        m = self.measurements
-        total = sum(
-            float(bound.loss.cost(state.in_cameras(c), m.pixels[:, :, c], bound.information[:, c], m.cameras))
-            for c in m.chunks()
-            for bound in self._camera_point.values()
-        )
-        total += sum(float(terms.cost) for terms in self.linearise_pairs(state).values())
-        return total + sum(float(terms.cost) for terms in self.linearise_tracks(state).values())
-
     def linearise_chunk(self, state: State, columns: slice) -> dict[str, CameraPointTerms]:
         """The camera-point losses, linearised at a slice of the columns N."""
         m = self.measurements

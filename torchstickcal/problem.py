@@ -16,7 +16,8 @@ from torchstickcal import se3
 from torchstickcal.cameras import Intrinsics
 from torchstickcal.observations import Observations
 
-_CHUNK_KEYPOINTS = 16384
+_CHUNK_KEYPOINTS = 10900
+"""Keypoints worked on at a time: three numbers of each stay below the size at which torch starts threads."""
 
 
 @dataclass(frozen=True)
@@ -90,11 +91,12 @@ class Measurements:
         """P"""
         return self.confidence.shape[1] // self.frames
 
-    def chunks(self) -> list[slice]:
-        """Slices of the columns, whole frames each, small enough for the arrays of one to stay in the cache."""
-        cameras, columns = self.confidence.shape
+    def chunks(self, columns: slice = slice(None)) -> list[slice]:
+        """Slices of some of the columns, whole frames each, small enough for the arrays of one to stay in the cache."""
+        cameras, total = self.confidence.shape
+        first, last = columns.start or 0, total if columns.stop is None else columns.stop
         width = self.points_per_frame * max(1, _CHUNK_KEYPOINTS // (self.points_per_frame * cameras))
-        return [slice(first, min(first + width, columns)) for first in range(0, columns, width)]
+        return [slice(start, min(start + width, last)) for start in range(first, last, width)]
 
     def stick_lengths_m(self, points: Tensor) -> Tensor:
         """Lengths (F, S) of the sticks among points (3, N); NaN in frames where an end is not active."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from torchstickcal.solvers.point_elimination import PointElimination
+from torchstickcal.symmetric import solve
 
 _MIN_DEPTH = 1e-3
 
@@ -43,7 +43,7 @@ def triangulate(
     points = rays.new_zeros(3, rays.shape[2])
     for _ in range(iterations):
         hessian = torch.where(unseen, identity, (products * current[:, None]).sum(0))
-        points = PointElimination(hessian, None).solve((moments * current[:, None]).sum(0))
+        points = solve(hessian, (moments * current[:, None]).sum(0))
         depth = (rotations[:, 2] @ points + translations[:, 2:]).clamp_min(_MIN_DEPTH)
         algebraic = (rows * points).sum(2) - targets
         squared = algebraic.square().sum(0) / depth.square()

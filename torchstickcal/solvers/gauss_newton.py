@@ -34,43 +34,45 @@ def gauss_newton(
     damping, step_m = _INITIAL_DAMPING, 0.0
     exact = _EXACT_COST_PER_KEYPOINT * float(objective.measurements.visible.sum())
     records: list[IterationRecord] = []
-    stop = Stop.ITERATIONS
     system = linearise(objective, state, cameras_free)
+    stop: Stop | None = None
     for iteration in range(termination.max_iterations + 1):
         records.append(system.record(stage, iteration, damping, step_m))
         listener(records[-1])
         if system.cost <= exact:
             stop = Stop.EXACT
+        if stop is not None or iteration == termination.max_iterations:
             break
-        if iteration == termination.max_iterations:
-            break
-        move = _descend(objective, state, system, damping, termination)
+        move = _descend(objective, state, system, damping, termination, cameras_free)
         if isinstance(move, Stop):
             stop = move
             break
-        state, damping, step_m = move.state, move.next_damping, _largest_movement(move.step)
+        decrease = system.cost - move.system.cost
         if move.step.leash < _SHORT_LEASH:
-            if move.decrease <= termination.cost_tolerance * system.cost:
+            if decrease <= termination.cost_tolerance * system.cost:
                 stop = Stop.COST
-                break
-            if move.step.camera_sigmas <= termination.camera_tolerance:
+            elif move.step.camera_sigmas <= termination.camera_tolerance:
                 stop = Stop.CAMERAS
-                break
-        system = linearise(objective, state, cameras_free)
-    return Outcome(state, stop, tuple(records))
+        state, system, damping, step_m = move.state, move.system, move.next_damping, _largest_movement(move.step)
+    return Outcome(state, stop or Stop.ITERATIONS, tuple(records))
 
 
 class _Move(NamedTuple):
-    """An accepted step: where it led, by how much the cost fell, and the next damping."""
+    """An accepted step: where it led, the system there, and the next damping."""
 
     state: State
+    system: NormalEquations
     step: Step
-    decrease: float
     next_damping: float
 
 
 def _descend(
-    objective: Objective, state: State, system: NormalEquations, damping: float, termination: Termination
+    objective: Objective,
+    state: State,
+    system: NormalEquations,
+    damping: float,
+    termination: Termination,
+    cameras_free: bool,
 ) -> _Move | Stop:
     """Raise the damping until a step lowers the cost, or say why none does.
 
@@ -86,11 +88,12 @@ def _descend(
                 damping = max(damping * _LOOSEN, _MIN_DAMPING)
                 continue
             candidate = state.retracted(step.cameras, step.points) if len(step.cameras) else state.moved(step.points)
-            decrease = system.cost - objective.cost(candidate)
+            reached = linearise(objective, candidate, cameras_free)
+            decrease = system.cost - reached.cost
             if decrease > 0:
                 agreement = decrease / step.predicted_decrease
                 factor = _LOOSEN if agreement > 0.75 else 1.0 if agreement > 0.25 else 4.0
-                return _Move(candidate, step, decrease, max(damping * factor, _MIN_DAMPING))
+                return _Move(candidate, reached, step, max(damping * factor, _MIN_DAMPING))
             if step.predicted_decrease <= termination.cost_tolerance * system.cost:
                 return Stop.COST
         refused = True

@@ -27,7 +27,8 @@ class _ScaledUnknowns:
     def __init__(self, system: NormalEquations, start: State) -> None:
         hessian = system.point_hessian.clone()
         hessian[[0, 3, 5]] *= 1 + _DAMPING
-        self._points = PointElimination(hessian, None)
+        measurements = system.objective.measurements
+        self._points = PointElimination(measurements.by_frame(hessian), measurements.pairs, None)
         self._cameras = torch.linalg.cholesky(system.reduced_system(_DAMPING)[0]).mT
         self._response = system.response(_DAMPING).flatten(1).mT
         self._extrinsics = Extrinsics(start.rotations, start.translations)

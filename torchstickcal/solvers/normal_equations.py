@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import reduce
 from typing import NamedTuple
 
 import torch
@@ -19,8 +20,12 @@ from torchstickcal import se3
 from torchstickcal.objective import Objective
 from torchstickcal.problem import State
 from torchstickcal.solvers.base import IterationRecord
-from torchstickcal.solvers.point_elimination import PointElimination, StickCoupling, outer
+from torchstickcal.solvers.cross_blocks import cross_rows, symmetric_times
+from torchstickcal.solvers.point_elimination import PointElimination
 from torchstickcal.solvers.track_elimination import TrackElimination
+from torchstickcal.symmetric import outer
+
+_ELIMINATED_COLUMNS = 30000
 
 
 class Step(NamedTuple):
@@ -75,17 +80,14 @@ class NormalEquations:
         Args:
             damping: factor by which the diagonal of the Hessian is raised.
         """
-        reduced, rhs, slices = self._reduce(damping)
+        reduced, rhs, eliminations = self._reduce(damping)
         factor, failed = torch.linalg.cholesky_ex(reduced)
         if int(failed) or not bool(factor.isfinite().all()):
             return None
         camera_step = -torch.cholesky_solve(rhs[:, None], factor).view(-1, 6)
-        twists = se3.hat(camera_step[:, 3:])
         point_step = torch.empty_like(self.point_gradient)
-        for columns, elimination in slices:
-            moved = twists @ self.points[:, columns] + camera_step[:, :3, None]
-            carried = _symmetric_times(self.cross[:, :, columns], moved).sum(0)
-            point_step[:, columns] = -elimination.solve(self.point_gradient[:, columns] + carried)
+        for columns, elimination in eliminations:
+            point_step[:, columns] = -elimination.solve(self.point_gradient[:, columns] + self._carried(columns, camera_step))
         diagonal = self.point_hessian[[0, 3, 5]]
         descent = -float((self.camera_gradient * camera_step).sum() + (self.point_gradient * point_step).sum())
         camera_diagonal = self.camera_hessian.diagonal(dim1=1, dim2=2)
@@ -101,10 +103,8 @@ class NormalEquations:
 
     def point_variance(self) -> Tensor:
         """Mean variance along the axes of each point (N,), cameras known, stick ends taken singly, square metres."""
-        identity = torch.eye(3, dtype=self.points.dtype, device=self.points.device)
-        columns = identity[..., None].expand(3, 3, self.points.shape[1])
-        half = PointElimination(self.point_hessian, None).half_solve(columns)
-        return half.square().unflatten(1, (3, -1)).sum((0, 1)) / 3
+        by_frame = self.objective.measurements.by_frame(self.point_hessian)
+        return PointElimination(by_frame, self.objective.measurements.pairs, None).variances().mean(0)
 
     def record(self, stage: str, iteration: int, damping: float, step_m: float) -> IterationRecord:
         """The record of the iteration that ends here."""
@@ -130,42 +130,55 @@ class NormalEquations:
         response = self.points.new_empty(6 * self.camera_hessian.shape[0], *self.points.shape)
         for columns in self._slices():
             elimination = self._eliminate(columns, damping)
-            rows = _times_b(self.cross[:, :, columns], self.points[:, columns]).flatten(0, 1)
+            rows = cross_rows(self.cross[:, :, columns], self.points[:, columns]).flatten(0, 1)
             for row, solved in zip(rows, response[..., columns], strict=True):
                 solved.copy_(-elimination.solve(row))
         return response
 
+    def _carried(self, columns: slice, camera_step: Tensor) -> Tensor:
+        """``H_xc`` times a step of the cameras, (3, n)."""
+        carried = torch.empty_like(self.points[:, columns])
+        twists, shifts = se3.hat(camera_step[:, 3:]), camera_step[:, :3, None]
+        for part in self.objective.measurements.chunks(columns):
+            moved = torch.baddbmm(shifts, twists, self.points[:, part].expand(len(twists), -1, -1))
+            offset = columns.start or 0
+            carried[:, part.start - offset : part.stop - offset] = symmetric_times(self.cross[:, :, part], moved)
+        return carried
+
     def _reduce(self, damping: float) -> tuple[Tensor, Tensor, list[tuple[slice, PointElimination | TrackElimination]]]:
+        """The reduced system, and the eliminations of the points with the columns they hold."""
         count = self.camera_hessian.shape[0]
         reduced = torch.block_diag(*_damped(self.camera_hessian, damping)) if count else self.cross.new_zeros(0, 0)
         rhs = self.camera_gradient.flatten().clone()
-        slices: list[tuple[slice, PointElimination | TrackElimination]] = []
+        eliminations: list[tuple[slice, PointElimination | TrackElimination]] = []
         for columns in self._slices():
             elimination = self._eliminate(columns, damping)
             if count:
-                half = elimination.half_solve(_times_b(self.cross[:, :, columns], self.points[:, columns]).flatten(0, 1))
-                reduced -= half @ half.mT
-                rhs -= half @ elimination.half_solve(self.point_gradient[None, :, columns])[0]
-            slices.append((columns, elimination))
-        return reduced, rhs, slices
+                arguments = self.cross[:, :, columns], self.points[:, columns], self.point_gradient[:, columns]
+                for rows, half in elimination.reductions(*arguments):
+                    reduced.addmm_(rows, rows.mT, alpha=-1)
+                    rhs.addmv_(rows, half, alpha=-1)
+            eliminations.append((columns, elimination))
+        return reduced, rhs, eliminations
 
     def _slices(self) -> list[slice]:
-        return [slice(None)] if self.next_frame is not None else self.objective.measurements.chunks()
+        """Columns that are eliminated together: all where tracks couple them, else as many as keep torch from threading."""
+        m = self.objective.measurements
+        frames = m.frames if self.next_frame is not None else max(1, _ELIMINATED_COLUMNS // m.points_per_frame)
+        width = frames * m.points_per_frame
+        return [slice(first, min(first + width, self.points.shape[1])) for first in range(0, self.points.shape[1], width)]
 
     def _eliminate(self, columns: slice, damping: float) -> PointElimination | TrackElimination:
         m = self.objective.measurements
         hessian = self.point_hessian[:, columns].clone()
         hessian[[0, 3, 5]] *= 1 + damping
+        by_frame = hessian.unflatten(1, (-1, m.points_per_frame))
         if self.next_frame is not None and self.second_frame is not None:
-            return TrackElimination(m.by_frame(hessian), m.pairs, self.pair_coupling, self.next_frame, self.second_frame)
-        if self.pair_coupling is None:
-            return PointElimination(hessian, None)
-        points = m.points_per_frame
-        frames = torch.arange(hessian.shape[1] // points, device=hessian.device)
-        first = (columns.start or 0) // points
-        blocks = self.pair_coupling[:, first : first + len(frames)]
-        starts, ends = ((frames[:, None] * points + end).flatten() for end in m.pairs.unbind(1))
-        return PointElimination(hessian, StickCoupling(starts, ends, blocks.flatten(1)))
+            return TrackElimination(by_frame, m.pairs, self.pair_coupling, self.next_frame, self.second_frame)
+        coupling = self.pair_coupling
+        if coupling is not None:
+            coupling = coupling[:, columns.start // m.points_per_frame : columns.stop // m.points_per_frame]
+        return PointElimination(by_frame, m.pairs, coupling)
 
 
 def linearise(objective: Objective, state: State, cameras_free: bool) -> NormalEquations:
@@ -181,24 +194,28 @@ def linearise(objective: Objective, state: State, cameras_free: bool) -> NormalE
     cameras, total = m.confidence.shape
     count = cameras - 1 if cameras_free else 0
     points = state.points
-    terms = dict.fromkeys(objective.losses, 0.0)
+    costs = {name: points.new_zeros(()) for name in objective.losses}
     squares, weights = points.new_zeros(cameras), points.new_zeros(cameras)
     cross = points.new_empty(count, 6, total)
-    point_hessian, point_gradient = points.new_zeros(6, total), points.new_zeros(3, total)
-    gradient_moments, hessian_moments = points.new_zeros(count, 3, 4), points.new_zeros(count, 6, 10)
+    point_hessian, point_gradient = points.new_empty(6, total), points.new_empty(3, total)
+    gradient_moments, hessian_moments = points.new_zeros(3 * count, 4), points.new_zeros(6 * count, 10)
     for columns in m.chunks():
         homogeneous = torch.cat([torch.ones_like(points[:1, columns]), points[:, columns]])
         products = homogeneous[_PRODUCTS[0]] * homogeneous[_PRODUCTS[1]]
-        cross[:, :, columns] = 0
-        for name, block in objective.linearise_chunk(state, columns).items():
-            terms[name] += float(block.cost)
+        blocks = objective.linearise_chunk(state, columns)
+        for name, block in blocks.items():
+            costs[name] += block.cost
             squares += block.squares
             weights += block.weights
-            point_hessian[:, columns] += block.hessian.sum(0)
-            point_gradient[:, columns] += block.gradient.sum(0)
-            cross[:, :, columns] += block.hessian[free]
-            gradient_moments += block.gradient[free] @ homogeneous.mT
-            hessian_moments += block.hessian[free] @ products.mT
+        gradient = reduce(torch.add, (block.gradient for block in blocks.values()))
+        hessian = reduce(torch.add, (block.hessian for block in blocks.values()))
+        torch.sum(gradient, 0, out=point_gradient[:, columns])
+        torch.sum(hessian, 0, out=point_hessian[:, columns])
+        if count:
+            cross[:, :, columns] = hessian[free]
+            gradient_moments.addmm_(gradient[free].flatten(0, 1), homogeneous.mT)
+            hessian_moments.addmm_(hessian[free].flatten(0, 1), products.mT)
+    terms = {name: float(cost) for name, cost in costs.items()}
     point_hessian[:, ~m.active] = point_hessian.new_tensor([1.0, 0, 0, 1, 0, 1])[:, None]
     pair_coupling = _add_pairs(objective, state, terms, m.by_frame(point_hessian), m.by_frame(point_gradient))
     bands = _add_tracks(objective, state, terms, m.by_frame(point_hessian), m.by_frame(point_gradient))
@@ -206,8 +223,8 @@ def linearise(objective: Objective, state: State, cameras_free: bool) -> NormalE
         terms=terms,
         reprojection_px=(squares / weights.clamp_min(1e-300)).sqrt(),
         points=points,
-        camera_hessian=_camera_hessian(hessian_moments),
-        camera_gradient=_camera_gradient(gradient_moments),
+        camera_hessian=_camera_hessian(hessian_moments.view(count, 6, 10)),
+        camera_gradient=_camera_gradient(gradient_moments.view(count, 3, 4)),
         cross=cross,
         point_hessian=point_hessian,
         point_gradient=point_gradient,
@@ -251,28 +268,6 @@ def _add_tracks(
         next_frame[1:] -= 2 * information
         second_frame += information
     return next_frame, second_frame
-
-
-def _times_b(blocks: Tensor, points: Tensor) -> Tensor:
-    """``(N B(X))^T`` as (C', 6, 3, n): first index the camera's tangent, second the point's axis."""
-    xx, xy, xz, yy, yz, zz = blocks.unbind(1)
-    product = blocks.new_empty(blocks.shape[0], 6, 3, blocks.shape[2])
-    product[:, 0, 0], product[:, 0, 1], product[:, 0, 2] = xx, xy, xz
-    product[:, 1, 0], product[:, 1, 1], product[:, 1, 2] = xy, yy, yz
-    product[:, 2, 0], product[:, 2, 1], product[:, 2, 2] = xz, yz, zz
-    x, y, z = points
-    column_x, column_y, column_z = product[:, 0], product[:, 1], product[:, 2]
-    torch.mul(column_z, y, out=product[:, 3]).addcmul_(column_y, z, value=-1)
-    torch.mul(column_x, z, out=product[:, 4]).addcmul_(column_z, x, value=-1)
-    torch.mul(column_y, x, out=product[:, 5]).addcmul_(column_x, y, value=-1)
-    return product
-
-
-def _symmetric_times(blocks: Tensor, vectors: Tensor) -> Tensor:
-    """N v for symmetric blocks (C', 6, n) and vectors (C', 3, n)."""
-    xx, xy, xz, yy, yz, zz = blocks.unbind(1)
-    x, y, z = vectors.unbind(1)
-    return torch.stack([xx * x + xy * y + xz * z, xy * x + yy * y + yz * z, xz * x + yz * y + zz * z], dim=1)
 
 
 def _damped(blocks: Tensor, damping: float) -> Tensor:

@@ -1,114 +1,100 @@
 """Elimination of points that are coupled within one frame at most: single points (3 x 3) and sticks (6 x 6).
 
-All blocks of N points are factored at once, entry by entry: a symmetric 3 x 3 matrix is six rows of length N in the order
-xx xy xz yy yz zz. With H = L L^T the factor serves as L^-1 b (half solve) and as H^-1 b (solve).
+All blocks of N = F P points are factored at once. With H = L L^T the factor serves as L^-1 b (half solve) and as H^-1 b.
 """
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from collections.abc import Iterator
 
 import torch
 from torch import Tensor
 
-_RELATIVE_PIVOT_FLOOR = 1e-13
+from torchstickcal.solvers.cross_blocks import add_rotations
+from torchstickcal.symmetric import backward, cholesky, expand, forward, gram
 
-
-class StickCoupling(NamedTuple):
-    """Blocks -M between the two ends of M sticks, each in its frame."""
-
-    starts: Tensor
-    """(M,), columns of the starts"""
-    ends: Tensor
-    """(M,), columns of the ends"""
-    blocks: Tensor
-    """(6, M), the symmetric matrices M"""
+_PART_KEYPOINTS = 10900
+"""Keypoints worked on at a time: their arrays stay in the cache, and below the size at which torch starts threads."""
 
 
 class PointElimination:
     """Cholesky factor of the structure's Hessian.
 
     Args:
-        hessian: diagonal blocks (6, N), positive definite, the sticks' share included.
-        sticks: the coupling of stick ends, or None.
+        hessian: diagonal blocks (6, F, P), positive definite, the sticks' share included.
+        pairs: (S, 2), the points that are ends of one stick.
+        coupling: (6, F, S), blocks M with -M between the two ends of a stick in a frame; None where there is none.
     """
 
-    def __init__(self, hessian: Tensor, sticks: StickCoupling | None) -> None:
-        self._sticks = sticks
-        if sticks is None:
-            self._lower = _cholesky(hessian)
+    def __init__(self, hessian: Tensor, pairs: Tensor, coupling: Tensor | None) -> None:
+        self._frames, self._points = hessian.shape[1:]
+        self._pairs = 0 if coupling is None else len(pairs)
+        hessian = hessian.flatten(1)
+        if coupling is None:
+            self._lower = cholesky(hessian)
             return
-        self._coupling = _forward(_cholesky(hessian[:, sticks.starts]), symmetric(sticks.blocks))
+        first = self._points * torch.arange(self._frames, device=hessian.device)[:, None]
+        self._starts, self._ends = ((first + side).flatten() for side in pairs.unbind(1))
+        self._coupling = forward(cholesky(hessian[:, self._starts]), expand(coupling.flatten(1)))
         reduced = hessian.clone()
-        reduced[:, sticks.ends] -= _gram(self._coupling)
-        self._lower = _cholesky(reduced)
-        self._carry = _forward(self._lower[:, sticks.ends], self._coupling.transpose(0, 1))
+        reduced[:, self._ends] -= gram(self._coupling)
+        self._lower = cholesky(reduced)
+        self._carry = forward(self._lower[:, self._ends], self._coupling.transpose(0, 1))
 
     def half_solve(self, rhs: Tensor) -> Tensor:
-        """``L^-1 b`` of right-hand sides (k, 3, N), flattened to (k, 3 N)."""
-        solved = _forward(self._lower, rhs)
-        if self._sticks is not None:
-            at_starts = solved[:, :, self._sticks.starts]
-            solved[:, :, self._sticks.ends] += (self._carry[None] * at_starts[:, :, None]).sum(1)
-        return solved.flatten(1)
+        """``L^-1 b`` of a right-hand side (3, N)."""
+        half = forward(self._lower, rhs)
+        if self._pairs:
+            half[:, self._ends] += (self._carry * half[:, self._starts]).sum(1)
+        return half
 
     def back_solve(self, half: Tensor) -> Tensor:
         """``L^-T b`` of a right-hand side (3, N), differentiable by it."""
-        if self._sticks is not None:
-            starts, ends, _ = self._sticks
-            at_ends = _backward(self._lower[:, ends], half[:, ends])
-            half = half.index_add(1, starts, (self._coupling * at_ends[:, None]).sum(0))
-        return _backward(self._lower, half)
+        if self._pairs:
+            at_ends = backward(self._lower[:, self._ends], half[:, self._ends])
+            half = half.index_add(1, self._starts, (self._coupling * at_ends).sum(1))
+        return backward(self._lower, half)
 
     def solve(self, rhs: Tensor) -> Tensor:
         """``H^-1 b`` of a right-hand side (3, N)."""
-        return self.back_solve(self.half_solve(rhs[None]).view_as(rhs))
+        return self.back_solve(self.half_solve(rhs))
+
+    def variances(self) -> Tensor:
+        """Diagonal of H^-1 (3, N) where no stick couples the points."""
+        half = forward(self._lower, torch.eye(3).to(self._lower)[..., None].expand(3, 3, self._lower.shape[1]))
+        return half.square().sum(0)
+
+    def reductions(self, cross: Tensor, points: Tensor, gradient: Tensor) -> Iterator[tuple[Tensor, Tensor]]:
+        """``(L^-1 H_xc)^T`` (6 C', 3 n) and ``L^-1 g`` (3 n,), for some frames at a time.
+
+        Args:
+            cross: the blocks N_c of C' cameras, (C', 6, N).
+            points: X, (3, N).
+            gradient: g, (3, N).
+        """
+        half = self.half_solve(gradient)
+        frames_at_once = max(1, _PART_KEYPOINTS // (self._points * max(1, cross.shape[0])))
+        for frame in range(0, self._frames, frames_at_once):
+            frames = min(frames_at_once, self._frames - frame)
+            columns = slice(frame * self._points, (frame + frames) * self._points)
+            rows = _camera_rows(self._lower[:, columns], cross[:, :, columns], points[:, columns])
+            if self._pairs:
+                sticks = slice(frame * self._pairs, (frame + frames) * self._pairs)
+                starts, ends = self._starts[: frames * self._pairs], self._ends[: frames * self._pairs]
+                at_starts = rows[..., starts]
+                rows[..., ends] += (self._carry[:, :, sticks] * at_starts[:, :, None]).sum(3)
+            yield rows.flatten(2).flatten(0, 1), half[:, columns].flatten()
 
 
-def symmetric(entries: Tensor) -> Tensor:
-    """Symmetric matrices (3, 3, N) of their six distinct entries (6, N)."""
-    xx, xy, xz, yy, yz, zz = entries
-    return torch.stack([xx, xy, xz, xy, yy, yz, xz, yz, zz]).unflatten(0, (3, 3))
-
-
-def outer(vectors: Tensor) -> Tensor:
-    """The six entries (6, ...) of v v^T for vectors (3, ...)."""
-    x, y, z = vectors
-    return torch.stack([x * x, x * y, x * z, y * y, y * z, z * z])
-
-
-def _gram(matrices: Tensor) -> Tensor:
-    """The six entries of A A^T, summed over the second axis, for matrices stored as (row, column, M)."""
-    a, b, c = matrices
-    return torch.stack([(p * q).sum(0) for p, q in ((a, a), (a, b), (a, c), (b, b), (b, c), (c, c))])
-
-
-def _cholesky(entries: Tensor) -> Tensor:
-    """Factors (6, N) as 1/l00 l10 l20 1/l11 l21 1/l22; pivots are kept above rounding."""
-    h = entries
-    r0 = h[0].rsqrt()
-    l10, l20 = h[1] * r0, h[2] * r0
-    r1 = torch.maximum(h[3] - l10 * l10, h[3] * _RELATIVE_PIVOT_FLOOR).rsqrt()
-    l21 = (h[4] - l20 * l10) * r1
-    r2 = torch.maximum(h[5] - l20 * l20 - l21 * l21, h[5] * _RELATIVE_PIVOT_FLOOR).rsqrt()
-    return torch.stack([r0, l10, l20, r1, l21, r2])
-
-
-def _forward(lower: Tensor, rhs: Tensor) -> Tensor:
-    """``L^-1 b`` for right-hand sides (..., 3, N)."""
+def _camera_rows(lower: Tensor, blocks: Tensor, points: Tensor) -> Tensor:
+    """``(L^-1 N B(X))^T`` as (C', 6, 3, n): the forward substitution of N's columns, then the rotations."""
     r0, l10, l20, r1, l21, r2 = lower
-    solved = torch.empty_like(rhs)
-    x, y, z = solved.unbind(-2)
-    torch.mul(rhs[..., 0, :], r0, out=x)
-    torch.addcmul(rhs[..., 1, :], l10, x, value=-1, out=y).mul_(r1)
-    torch.addcmul(rhs[..., 2, :], l20, x, value=-1, out=z).addcmul_(l21, y, value=-1).mul_(r2)
-    return solved
-
-
-def _backward(lower: Tensor, rhs: Tensor) -> Tensor:
-    """``L^-T b`` for a right-hand side (3, N)."""
-    r0, l10, l20, r1, l21, r2 = lower
-    z = rhs[2] * r2
-    y = (rhs[1] - l21 * z) * r1
-    x = (rhs[0] - l10 * y - l20 * z) * r0
-    return torch.stack([x, y, z])
+    rows = blocks.new_empty(blocks.shape[0], 6, 3, blocks.shape[2])
+    x, y, z = rows[:, :3].unbind(2)
+    torch.mul(blocks[:, :3], r0, out=x)
+    y[:, 0], y[:, 1:] = blocks[:, 1], blocks[:, 3:5]
+    y.addcmul_(x, l10, value=-1).mul_(r1)
+    z[:, 0], z[:, 1:] = blocks[:, 2], blocks[:, 4:]
+    z.addcmul_(x, l20, value=-1).addcmul_(y, l21, value=-1).mul_(r2)
+    add_rotations(rows, points)
+    return rows

@@ -7,12 +7,14 @@ what is left is block tridiagonal again with half as many blocks. Stick ends for
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
-from torchstickcal.solvers.point_elimination import symmetric
+from torchstickcal.solvers.cross_blocks import cross_rows
+from torchstickcal.symmetric import expand
 
 
 class _Level(NamedTuple):
@@ -92,16 +94,19 @@ class TrackElimination:
         singles = (~paired).nonzero()
         self._groups = [singles] if coupling is None else [singles, pairs]
         self._factors: list[BlockTridiagonal] = []
-        blocks = symmetric(hessian.flatten(1)).unflatten(-1, hessian.shape[1:])
+        blocks = expand(hessian.flatten(1)).unflatten(-1, hessian.shape[1:])
         for members in self._groups:
             diagonal = self._diagonal(blocks, members, coupling)
             steps = [self._by_track(step.expand(3, -1, -1), members)[..., 0] for step in (next_frame, second_frame)]
             self._factors.append(BlockTridiagonal(*_two_frames_a_block(diagonal, *steps)))
 
-    def half_solve(self, rhs: Tensor) -> Tensor:
-        """``L^-1 b`` of right-hand sides (k, 3, N), as (k, M) with the unknowns in the order of elimination."""
-        levels = [level for half in self._half(rhs) for level in half]
-        return torch.cat([level.flatten(0, -2) for level in levels]).mT
+    def reductions(self, cross: Tensor, points: Tensor, gradient: Tensor) -> Iterator[tuple[Tensor, Tensor]]:
+        """``(L^-1 H_xc)^T`` and ``L^-1 g`` of :class:`PointElimination`, the unknowns in the order of elimination."""
+        rhs = torch.cat([cross_rows(cross, points).flatten(0, 1), gradient[None]])
+        for half in self._half(rhs):
+            for level in half:
+                rows = level.flatten(0, -2).mT
+                yield rows[:-1], rows[-1]
 
     def solve(self, rhs: Tensor) -> Tensor:
         """``H^-1 b`` of a right-hand side (3, N)."""
@@ -135,7 +140,7 @@ class TrackElimination:
             return first
         assert coupling is not None
         second = blocks[..., members[:, 1]].permute(3, 2, 0, 1)
-        between = -symmetric(coupling.flatten(1)).unflatten(-1, coupling.shape[1:]).permute(3, 2, 0, 1)
+        between = -expand(coupling.flatten(1)).unflatten(-1, coupling.shape[1:]).permute(3, 2, 0, 1)
         return torch.cat([torch.cat([first, between], -1), torch.cat([between, second], -1)], -2)
 
 
