@@ -88,6 +88,8 @@ class Objective:
 
     def linearise_tracks(self, state: State) -> dict[str, TrackTerms]:
         """The track losses, linearised."""
+        if not self._track:
+            return {}
         m = self.measurements
         active = m.by_frame(m.active)
         return {name: loss.linearise(m.by_frame(state.points), active) for name, loss in self._track.items()}

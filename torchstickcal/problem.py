@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Collection
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import torch
 from torch import Tensor
@@ -71,17 +72,22 @@ class Measurements:
         x, y = self.cameras.project_components(*state.in_cameras().unbind(1))
         return (x - self.pixels[:, 0]).square() + (y - self.pixels[:, 1]).square()
 
-    @property
+    @cached_property
     def visible(self) -> Tensor:
         """(C, N), True where a keypoint counts."""
         return self.confidence > 0
 
-    @property
+    @cached_property
     def active(self) -> Tensor:
         """(N,), True where two cameras or more see the point."""
         return self.visible.any(0)
 
-    @property
+    @cached_property
+    def inactive_columns(self) -> Tensor:
+        """Indices (K,) of the columns that are not active."""
+        return (~self.active).nonzero()[:, 0]
+
+    @cached_property
     def pair_active(self) -> Tensor:
         """(F, S), True where both ends of a stick are active."""
         return self.by_frame(self.active)[:, self.pairs].all(-1)

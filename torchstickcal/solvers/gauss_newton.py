@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
+import torch
+
 from torchstickcal.objective import Objective
 from torchstickcal.problem import State
 from torchstickcal.solvers.base import IterationRecord, Listener, Outcome, Stop, Termination
@@ -15,6 +17,7 @@ _MAX_DAMPING = 1e8
 _LOOSEN = 0.03
 _SHORT_LEASH = 0.5
 _NOTHING = 0.01
+_LARGE_BLOCK_BYTES = 31 * 2**20
 _EXACT_COST_PER_KEYPOINT = 1e-18
 
 
@@ -31,6 +34,7 @@ def gauss_newton(
 
     A step is taken only if it lowers the cost, so the state returned is never worse than the one given.
     """
+    _keep_freed_memory()
     damping, step_m = _INITIAL_DAMPING, 0.0
     exact = _EXACT_COST_PER_KEYPOINT * float(objective.measurements.visible.sum())
     records: list[IterationRecord] = []
@@ -99,6 +103,15 @@ def _descend(
         refused = True
         damping = max(damping, 1e-8) * 10
     return Stop.DIVERGED
+
+
+def _keep_freed_memory() -> None:
+    """Have the C library keep freed blocks of the size of our arrays, as it does once it has seen a larger one freed.
+
+    glibc otherwise gives each back to the system, and the first touch of every page of the next one costs more than the
+    arithmetic on it.
+    """
+    torch.empty(_LARGE_BLOCK_BYTES, dtype=torch.uint8)
 
 
 def _largest_movement(step: Step) -> float:

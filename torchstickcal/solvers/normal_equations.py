@@ -8,9 +8,10 @@ the reduced camera system is S = H_cc - W^T W.
 
 from __future__ import annotations
 
+import itertools
 import math
 from dataclasses import dataclass
-from functools import reduce
+from functools import lru_cache, reduce
 from typing import NamedTuple
 
 import torch
@@ -216,15 +217,17 @@ def linearise(objective: Objective, state: State, cameras_free: bool) -> NormalE
             gradient_moments.addmm_(gradient[free].flatten(0, 1), homogeneous.mT)
             hessian_moments.addmm_(hessian[free].flatten(0, 1), products.mT)
     terms = {name: float(cost) for name, cost in costs.items()}
-    point_hessian[:, ~m.active] = point_hessian.new_tensor([1.0, 0, 0, 1, 0, 1])[:, None]
+    if len(m.inactive_columns):
+        point_hessian[:, m.inactive_columns] = point_hessian.new_tensor([1.0, 0, 0, 1, 0, 1])[:, None]
     pair_coupling = _add_pairs(objective, state, terms, m.by_frame(point_hessian), m.by_frame(point_gradient))
     bands = _add_tracks(objective, state, terms, m.by_frame(point_hessian), m.by_frame(point_gradient))
+    gradient_map, hessian_map = _moment_maps(points.dtype, points.device)
     return NormalEquations(
         terms=terms,
         reprojection_px=(squares / weights.clamp_min(1e-300)).sqrt(),
         points=points,
-        camera_hessian=_camera_hessian(hessian_moments.view(count, 6, 10)),
-        camera_gradient=_camera_gradient(gradient_moments.view(count, 3, 4)),
+        camera_hessian=(hessian_moments.view(count, 60) @ hessian_map).view(count, 6, 6),
+        camera_gradient=gradient_moments.view(count, 12) @ gradient_map,
         cross=cross,
         point_hessian=point_hessian,
         point_gradient=point_gradient,
@@ -278,24 +281,21 @@ _PRODUCTS = ([0, 0, 0, 0, 1, 1, 1, 2, 2, 3], [0, 1, 2, 3, 1, 2, 3, 2, 3, 3])
 """The ten distinct products of the homogeneous coordinates (1, x, y, z)."""
 
 
-def _jacobian_basis() -> Tensor:
-    """(4, 3, 6): B(X) = sum_a (1, X)_a basis_a."""
-    basis = torch.zeros(4, 3, 6, dtype=torch.float64)
-    basis[0, :, :3] = torch.eye(3, dtype=torch.float64)
-    basis[1:, :, 3:] = -se3.hat(torch.eye(3, dtype=torch.float64))
-    return basis
+@lru_cache(maxsize=8)
+def _moment_maps(dtype: torch.dtype, device: torch.device) -> tuple[Tensor, Tensor]:
+    """The maps from moments of gradients (12) and of Hessians (60) to those of a camera, (12, 6) and (60, 36).
 
-
-def _camera_gradient(moments: Tensor) -> Tensor:
-    """(C', 6): sum over points of B^T g, from the moments (C', 3, 4) of g with (1, x, y, z)."""
-    return torch.einsum("cia,aip->cp", moments, _jacobian_basis().to(moments))
-
-
-def _camera_hessian(moments: Tensor) -> Tensor:
-    """(C', 6, 6): sum over points of B^T N B, from the moments (C', 6, 10) of N with the products."""
-    basis = _jacobian_basis().to(moments)
-    rows = torch.tensor([[0, 1, 2], [1, 3, 4], [2, 4, 5]])
-    pairs = torch.empty(4, 4, dtype=torch.long)
-    pairs[_PRODUCTS] = pairs[_PRODUCTS[::-1]] = torch.arange(10)
-    full = moments[:, rows][..., pairs]
-    return torch.einsum("aip,cijab,bjq->cpq", basis, full, basis)
+    With B(X) = sum_a (1, X)_a B_a the sums of B^T g and B^T N B over the points are linear in the moments of g with
+    (1, x, y, z) and of N with their ten products.
+    """
+    basis = torch.zeros(4, 3, 6, dtype=dtype)
+    basis[0, :, :3] = torch.eye(3)
+    basis[1:, :, 3:] = -se3.hat(torch.eye(3, dtype=dtype))
+    hessian_map = torch.zeros(6, 10, 6, 6, dtype=dtype)
+    entries = torch.tensor([[0, 1, 2], [1, 3, 4], [2, 4, 5]])
+    product = torch.zeros(4, 4, dtype=torch.long)
+    product[_PRODUCTS] = product[_PRODUCTS[::-1]] = torch.arange(10)
+    for a, b, i, j in itertools.product(range(4), range(4), range(3), range(3)):
+        hessian_map[entries[i, j], product[a, b]] += torch.outer(basis[a, i], basis[b, j])
+    gradient_map = basis.transpose(0, 1).reshape(12, 6)
+    return gradient_map.to(device), hessian_map.view(60, 36).to(device)
