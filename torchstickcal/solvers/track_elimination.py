@@ -16,11 +16,14 @@ from torch import Tensor
 from torchstickcal.solvers.cross_blocks import cross_rows
 from torchstickcal.symmetric import expand
 
+_PART_POINTS = 3000
+"""Points worked on at a time, so that their right-hand sides stay in the cache."""
+
 
 class _Level(NamedTuple):
-    """One elimination: the factors of the odd blocks and their coupling to the even blocks left and right."""
+    """One elimination: the inverse factors of the odd blocks and their coupling to the even blocks left and right."""
 
-    lower: Tensor
+    inverse: Tensor
     left: Tensor
     right: Tensor
 
@@ -36,42 +39,46 @@ class BlockTridiagonal:
     def __init__(self, diagonal: Tensor, below: Tensor) -> None:
         self._levels: list[_Level] = []
         while diagonal.shape[-3] > 1:
-            lower = torch.linalg.cholesky(diagonal[..., 1::2, :, :])
-            left = torch.linalg.solve_triangular(lower, below[..., 0::2, :, :], upper=False)
-            right = torch.linalg.solve_triangular(
-                lower[..., : below.shape[-3] // 2, :, :], below[..., 1::2, :, :].mT, upper=False
-            )
+            inverse = _inverse_factor(diagonal[..., 1::2, :, :])
+            to_right = below[..., 1::2, :, :].mT
+            left = inverse @ below[..., 0::2, :, :]
+            right = inverse[..., : to_right.shape[-3], :, :] @ to_right
             diagonal = diagonal[..., 0::2, :, :].clone()
             diagonal[..., : left.shape[-3], :, :] -= left.mT @ left
             diagonal[..., 1 : 1 + right.shape[-3], :, :] -= right.mT @ right
             below = -right.mT @ left[..., : right.shape[-3], :, :]
-            self._levels.append(_Level(lower, left, right))
-        self._last = torch.linalg.cholesky(diagonal)
+            self._levels.append(_Level(inverse, left, right))
+        self._last = _inverse_factor(diagonal)
 
     def half_solve(self, rhs: Tensor) -> list[Tensor]:
         """``L^-1 b`` of right-hand sides (..., G, m, k), the blocks in their order of elimination, level by level."""
         solved: list[Tensor] = []
         for level in self._levels:
-            odd = torch.linalg.solve_triangular(level.lower, rhs[..., 1::2, :, :], upper=False)
+            odd = level.inverse @ rhs[..., 1::2, :, :]
             rhs = rhs[..., 0::2, :, :].clone()
             count = level.right.shape[-3]
             rhs[..., : odd.shape[-3], :, :] -= level.left.mT @ odd
             rhs[..., 1 : 1 + count, :, :] -= level.right.mT @ odd[..., :count, :, :]
             solved.append(odd)
-        return [*solved, torch.linalg.solve_triangular(self._last, rhs, upper=False)]
+        return [*solved, self._last @ rhs]
 
     def back_solve(self, solved: list[Tensor]) -> Tensor:
         """``L^-T y`` (..., G, m, k) of what :meth:`half_solve` returned."""
-        x = torch.linalg.solve_triangular(self._last.mT, solved[-1], upper=True)
+        x = self._last.mT @ solved[-1]
         for level, y in zip(reversed(self._levels), reversed(solved[:-1]), strict=True):
             count = level.right.shape[-3]
             y = y - level.left @ x[..., : y.shape[-3], :, :]
             y[..., :count, :, :] -= level.right @ x[..., 1 : 1 + count, :, :]
-            odd = torch.linalg.solve_triangular(level.lower.mT, y, upper=True)
-            merged = x.new_empty(*x.shape[:-3], x.shape[-3] + odd.shape[-3], *x.shape[-2:])
-            merged[..., 0::2, :, :], merged[..., 1::2, :, :] = x, odd
+            merged = x.new_empty(*x.shape[:-3], x.shape[-3] + y.shape[-3], *x.shape[-2:])
+            merged[..., 0::2, :, :], merged[..., 1::2, :, :] = x, level.inverse.mT @ y
             x = merged
         return x
+
+
+def _inverse_factor(blocks: Tensor) -> Tensor:
+    """Inverses of the Cholesky factors of blocks (..., m, m)."""
+    identity = torch.eye(blocks.shape[-1], dtype=blocks.dtype, device=blocks.device).expand_as(blocks)
+    return torch.linalg.solve_triangular(torch.linalg.cholesky(blocks), identity, upper=False)
 
 
 class TrackElimination:
@@ -88,44 +95,51 @@ class TrackElimination:
     def __init__(
         self, hessian: Tensor, pairs: Tensor, coupling: Tensor | None, next_frame: Tensor, second_frame: Tensor
     ) -> None:
-        _, self._frames, points = hessian.shape
-        paired = torch.zeros(points, dtype=torch.bool, device=hessian.device)
+        _, self._frames, self._points = hessian.shape
+        paired = torch.zeros(self._points, dtype=torch.bool, device=hessian.device)
         paired[pairs.flatten()] = coupling is not None
-        singles = (~paired).nonzero()
-        self._groups = [singles] if coupling is None else [singles, pairs]
+        self._groups: list[Tensor] = []
         self._factors: list[BlockTridiagonal] = []
         blocks = expand(hessian.flatten(1)).unflatten(-1, hessian.shape[1:])
-        for members in self._groups:
-            diagonal = self._diagonal(blocks, members, coupling)
+        together = max(1, _PART_POINTS // self._frames)
+        parts = [(members, None) for members in (~paired).nonzero().split(together)]
+        if coupling is not None:
+            parts += list(zip(pairs.split(together), coupling.split(together, dim=-1), strict=True))
+        for members, between in parts:
+            diagonal = self._diagonal(blocks, members, between)
             steps = [self._by_track(step.expand(3, -1, -1), members)[..., 0] for step in (next_frame, second_frame)]
+            self._groups.append(members)
             self._factors.append(BlockTridiagonal(*_two_frames_a_block(diagonal, *steps)))
 
     def reductions(self, cross: Tensor, points: Tensor, gradient: Tensor) -> Iterator[tuple[Tensor, Tensor]]:
         """``(L^-1 H_xc)^T`` and ``L^-1 g`` of :class:`PointElimination`, the unknowns in the order of elimination."""
-        rhs = torch.cat([cross_rows(cross, points).flatten(0, 1), gradient[None]])
-        for half in self._half(rhs):
-            for level in half:
-                rows = level.flatten(0, -2).mT
-                yield rows[:-1], rows[-1]
+        for members, factor in zip(self._groups, self._factors, strict=True):
+            columns = self._columns(members)
+            rows = cross_rows(cross[:, :, columns], points[:, columns]).permute(2, 0, 1, 3).flatten(1, 2)
+            half = factor.half_solve(self._blocks(torch.cat([rows, gradient[:, None, columns]], dim=1), members))
+            solved = torch.cat([level.flatten(0, -2) for level in half]).mT
+            yield solved[:-1], solved[-1]
 
     def solve(self, rhs: Tensor) -> Tensor:
         """``H^-1 b`` of a right-hand side (3, N)."""
-        solution = rhs.new_empty(rhs.shape).unflatten(-1, (self._frames, -1))
-        for members, factor, half in zip(self._groups, self._factors, self._half(rhs[None]), strict=True):
-            tracks = factor.back_solve(half).flatten(1, 2)[..., 0]
-            width = 3 * members.shape[1]
-            tracks = tracks.view(tracks.shape[0], -1, width)[:, : self._frames].unflatten(-1, (-1, 3))
-            solution[:, :, members] = tracks.permute(3, 1, 0, 2)
-        return solution.flatten(1)
-
-    def _half(self, rhs: Tensor) -> list[list[Tensor]]:
-        by_frame = rhs.unflatten(-1, (self._frames, -1))
-        halves: list[list[Tensor]] = []
+        solution = torch.empty_like(rhs)
         for members, factor in zip(self._groups, self._factors, strict=True):
-            tracks = by_frame[..., members].permute(3, 2, 4, 1, 0).flatten(2, 3)
-            odd = torch.nn.functional.pad(tracks, (0, 0, 0, 0, 0, self._frames % 2))
-            halves.append(factor.half_solve(odd.unflatten(1, (-1, 2)).flatten(2, 3)))
-        return halves
+            columns = self._columns(members)
+            half = factor.half_solve(self._blocks(rhs[:, None, columns], members))
+            tracks = factor.back_solve(half).flatten(1)[:, : 3 * members.shape[1] * self._frames]
+            solution[:, columns] = tracks.reshape(-1, 3).mT
+        return solution
+
+    def _columns(self, members: Tensor) -> Tensor:
+        """Columns of the points of tracks (T, q), ordered track, frame, member."""
+        frames = torch.arange(self._frames, device=members.device)[:, None] * self._points
+        return (members[:, None] + frames).flatten()
+
+    def _blocks(self, rhs: Tensor, members: Tensor) -> Tensor:
+        """Right-hand sides (3, k, n) of the tracks' columns as blocks of two frames, (T, G, 6 q, k)."""
+        tracks = rhs.flatten(0, 1).mT.contiguous().view(len(members), self._frames, -1, rhs.shape[1])
+        padded = torch.nn.functional.pad(tracks, (0, 0, 0, 0, 0, 1)) if self._frames % 2 else tracks
+        return padded.unflatten(1, (-1, 2)).flatten(2, 3)
 
     @staticmethod
     def _by_track(values: Tensor, members: Tensor) -> Tensor:
@@ -136,9 +150,8 @@ class TrackElimination:
     def _diagonal(blocks: Tensor, members: Tensor, coupling: Tensor | None) -> Tensor:
         """Blocks (T, F, m, m) of the tracks, of point blocks (3, 3, F, P)."""
         first = blocks[..., members[:, 0]].permute(3, 2, 0, 1)
-        if members.shape[1] == 1:
+        if coupling is None:
             return first
-        assert coupling is not None
         second = blocks[..., members[:, 1]].permute(3, 2, 0, 1)
         between = -expand(coupling.flatten(1)).unflatten(-1, coupling.shape[1:]).permute(3, 2, 0, 1)
         return torch.cat([torch.cat([first, between], -1), torch.cat([between, second], -1)], -2)
