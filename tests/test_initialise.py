@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 import numpy as np
 import pytest
 import torch
@@ -10,7 +12,7 @@ from torchstickcal import Observations, RigError, calibrate, metrics
 from torchstickcal.config import InitialiseSettings
 from torchstickcal.initialise import initialise
 from torchstickcal.initialise.graph import Edge, propagate, spanning_tree
-from torchstickcal.initialise.pairs import Pair, RelativePose, relative_poses
+from torchstickcal.initialise.pairs import Pair, RelativePose, relate
 from torchstickcal.initialise.triangulate import triangulate
 from torchstickcal.problem import Measurements
 from torchstickcal.simulate import Noise, golf_session
@@ -29,17 +31,21 @@ def test_rig_comes_back_up_to_scale(cameras: int):
     assert (ratios.max() / ratios.min()) < 1.1
 
 
-def test_spanning_tree_takes_the_strongest_pairs():
+def test_spanning_tree_takes_the_strongest_pairs_and_relates_no_more_than_it_must():
+    inliers = {(0, 1): 90, (0, 2): 20, (0, 3): 30, (1, 2): 80, (1, 3): 30, (2, 3): 70}
+    common = np.full((4, 4), 100)
+    common[0, 3] = common[3, 0] = 40
+    common[1, 3] = common[3, 1] = 60
     pose = RelativePose(np.eye(3), np.array([0.0, 0, 1]), 1)
-    pairs = [
-        Pair(0, 1, 100, 90, (pose,)),
-        Pair(0, 2, 100, 20, (pose,)),
-        Pair(0, 3, 100, 30, (pose,)),
-        Pair(1, 2, 100, 80, (pose,)),
-        Pair(2, 3, 100, 70, (pose,)),
-    ]
-    edges = spanning_tree(pairs, ["a", "b", "c", "d"], 20)
+    asked: list[tuple[int, int]] = []
+
+    def relate(first: int, second: int) -> Pair:
+        asked.append((first, second))
+        return Pair(first, second, int(common[first, second]), inliers[first, second], (pose,))
+
+    edges = spanning_tree(common, relate, ["a", "b", "c", "d"], 20)
     assert [(edge.parent, edge.child) for edge in edges] == [(0, 1), (1, 2), (2, 3)]
+    assert sorted(asked) == [(0, 1), (0, 2), (1, 2), (2, 3)]
 
 
 def test_cut_off_cameras_are_named_with_their_counts():
@@ -58,13 +64,13 @@ def test_a_third_view_tells_the_true_pose_from_its_twin():
     measurements = Measurements.of(observations)
     rays = measurements.cameras.undistort(measurements.pixels.movedim(1, -1)).movedim(-1, 1).numpy()
     visible = measurements.visible.numpy()
-    focal = measurements.cameras.focal_px.numpy()
-    pairs = relative_poses(rays, visible, focal, min_common=20, max_points=200, threshold_px=2.0)
-    edges = spanning_tree(pairs, ["0", "1", "2"], 20)
+    find = partial(relate, rays, visible, measurements.cameras.focal_px.numpy(), max_points=200, threshold_px=2.0)
+    common = visible.astype(int) @ visible.T.astype(int)
+    edges = spanning_tree(common, find, ["0", "1", "2"], 20)
     first = edges[0]
     wrong_first = tuple(
         RelativePose(pose.rotation, pose.translation, count)
-        for pose, count in zip(reversed(first.poses), (600, 500, 400, 400), strict=True)
+        for pose, count in zip(reversed(first.poses), (200, 190, 180, 180), strict=True)
     )
     rotations, _ = propagate([Edge(first.parent, first.child, wrong_first), *edges[1:]], rays, visible, scale=0.02)
     relative = (truth.rotations @ truth.rotations[0].mT).numpy()

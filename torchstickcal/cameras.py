@@ -153,6 +153,10 @@ class Intrinsics:
         fx, skew, cx, fy, cy = self._pixel_map(u.ndim)
         return fx * u + skew * v + cx, fy * v + cy
 
+    @property
+    def _has_denominator(self) -> bool:
+        return self.distortion is not None and self.distortion.shape[1] > 5
+
     def _coefficients(self, ndim: int) -> list[Tensor]:
         assert self.distortion is not None
         padding = 0 if self.fisheye else 8 - self.distortion.shape[1]
@@ -164,9 +168,11 @@ class Intrinsics:
         k1, k2, p1, p2, k3, k4, k5, k6 = self._coefficients(u.ndim)
         r2 = u * u + v * v
         numerator = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
+        numerator_slope = k1 + r2 * (2 * k2 + 3 * r2 * k3)
+        if not self._has_denominator:
+            return numerator, numerator_slope, p1, p2, r2
         denominator = 1 + r2 * (k4 + r2 * (k5 + r2 * k6))
         radial = numerator / denominator
-        numerator_slope = k1 + r2 * (2 * k2 + 3 * r2 * k3)
         denominator_slope = k4 + r2 * (2 * k5 + 3 * r2 * k6)
         return radial, (numerator_slope - radial * denominator_slope) / denominator, p1, p2, r2
 

@@ -36,7 +36,7 @@ class InitialiseSettings:
 
     min_common_points: int = 20
     max_points: int = 200
-    threshold_px: float = 2.0
+    threshold_px: float = 4.0
 
 
 @dataclass(frozen=True)

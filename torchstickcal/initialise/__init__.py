@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import partial
 
 import numpy as np
 import torch
 
 from torchstickcal.config import InitialiseSettings
 from torchstickcal.initialise.graph import propagate, spanning_tree
-from torchstickcal.initialise.pairs import relative_poses
+from torchstickcal.initialise.pairs import relate
 from torchstickcal.initialise.triangulate import triangulate
 from torchstickcal.problem import Measurements, State
 
@@ -35,15 +36,16 @@ def initialise(measurements: Measurements, settings: InitialiseSettings, labels:
     rays = rays.nan_to_num()
     focal_px = measurements.cameras.focal_px
     rays_np, visible_np = rays.cpu().numpy(), visible.cpu().numpy()
-    pairs = relative_poses(
+    find = partial(
+        relate,
         rays_np,
         visible_np,
         focal_px.cpu().numpy(),
-        min_common=settings.min_common_points,
         max_points=settings.max_points,
         threshold_px=settings.threshold_px,
     )
-    edges = spanning_tree(pairs, labels, settings.min_common_points)
+    common = visible_np.astype(np.int64) @ visible_np.T.astype(np.int64)
+    edges = spanning_tree(common, find, labels, settings.min_common_points)
     scale = _SUPPORT_RADIUS * settings.threshold_px / float(focal_px.mean())
     poses = propagate(edges, rays_np, visible_np, scale)
     rotations, translations = (torch.from_numpy(np.ascontiguousarray(p)).to(rays) for p in poses)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -10,10 +10,12 @@ import torch
 from numpy.typing import NDArray
 
 from torchstickcal.errors import RigError
-from torchstickcal.initialise.pairs import Array, Pair, RelativePose, two_view_depths
+from torchstickcal.initialise.pairs import Array, Pair, RelativePose, spread, two_view_depths
 from torchstickcal.initialise.triangulate import triangulate
 
 _PLAUSIBLE_SHARE = 0.5
+_NEARLY_ALL = 0.9
+_MAX_POINTS = 400
 
 
 class Edge(NamedTuple):
@@ -24,22 +26,40 @@ class Edge(NamedTuple):
     poses: tuple[RelativePose, ...]
 
 
-def spanning_tree(pairs: Sequence[Pair], labels: Sequence[str], min_common: int) -> list[Edge]:
+def spanning_tree(
+    common: NDArray[np.int_], relate: Callable[[int, int], Pair], labels: Sequence[str], min_common: int
+) -> list[Edge]:
     """Maximum spanning tree over inlier counts, rooted at the first camera, in the order of growth.
+
+    Relating a pair costs more than all the rest, and it cannot have more inliers than common points. So a pair is related
+    only when no pair that could join the tree promises more, and is taken at once if nearly all its points are inliers.
+
+    Args:
+        common: (C, C), the number of points two cameras have in common.
+        relate: finds the relative poses of two cameras.
+        labels: the cameras' names, for messages.
+        min_common: fewest common points of a pair.
 
     Raises:
         RigError: if some camera cannot be reached, naming it and the pairs that fell short.
     """
-    placed, edges = {0}, list[Edge]()
+    cameras = range(len(labels))
+    placed, edges, related = {0}, list[Edge](), dict[tuple[int, int], Pair]()
     while len(placed) < len(labels):
-        crossing = [p for p in pairs if p.poses and (p.first in placed) != (p.second in placed)]
-        if not crossing:
-            raise _disconnected(pairs, placed, labels, min_common)
-        best = max(crossing, key=lambda p: p.inliers)
-        if best.first in placed:
-            edges.append(Edge(best.first, best.second, best.poses))
+        crossing = [(i, j) for i in cameras for j in cameras if i < j and (i in placed) != (j in placed)]
+        promised = {pair: related[pair].inliers if pair in related else int(common[pair]) for pair in crossing}
+        best = max(crossing, key=lambda pair: promised[pair])
+        if promised[best] < min_common:
+            raise _disconnected({pair: int(common[pair]) for pair in crossing}, placed, labels, min_common)
+        if best not in related:
+            related[best] = relate(*best)
+            if related[best].inliers < _NEARLY_ALL * related[best].common:
+                continue
+        poses = related[best].poses
+        if best[0] in placed:
+            edges.append(Edge(best[0], best[1], poses))
         else:
-            edges.append(Edge(best.second, best.first, tuple(pose.inverse() for pose in best.poses)))
+            edges.append(Edge(best[1], best[0], tuple(pose.inverse() for pose in poses)))
         placed.add(edges[-1].child)
     return edges
 
@@ -50,7 +70,8 @@ def propagate(edges: Sequence[Edge], rays: Array, visible: NDArray[np.bool_], sc
     A pose out of an essential matrix is one of four, and the count of points in front of both cameras does not always
     tell which: the twisted twin is told from the true one by a third camera, in which it projects the points elsewhere.
     So the tree is grown from every plausible pose of the first edge, at each edge the pose is taken that the points
-    placed so far support best, and the tree with most support is returned.
+    placed so far support best, and the tree with most support is returned. A few hundred points, spread over the session,
+    tell.
 
     Args:
         edges: the tree, in order of growth.
@@ -58,6 +79,9 @@ def propagate(edges: Sequence[Edge], rays: Array, visible: NDArray[np.bool_], sc
         visible: (C, N).
         scale: residual, in normalised coordinates, up to which a point supports a pose.
     """
+    columns = np.flatnonzero(visible.sum(0) >= 2)
+    columns = columns[spread(len(columns), _MAX_POINTS)]
+    rays, visible = rays[:, :, columns], visible[:, columns]
     first = edges[0].poses
     plausible = [pose for pose in first if pose.in_front >= _PLAUSIBLE_SHARE * first[0].in_front]
     trees = [_grow(root, edges, rays, visible, scale) for root in plausible]
@@ -115,14 +139,13 @@ def _attach(
     return float(((z > 0) / (1 + squared / scale**2)).sum()), rotation, translation
 
 
-def _disconnected(pairs: Sequence[Pair], placed: set[int], labels: Sequence[str], min_common: int) -> RigError:
+def _disconnected(common: dict[tuple[int, int], int], placed: set[int], labels: Sequence[str], min_common: int) -> RigError:
     cut_off = [label for index, label in enumerate(labels) if index not in placed]
-    crossing = [p for p in pairs if (p.first in placed) != (p.second in placed)]
-    counts = ", ".join(f"{labels[p.first]} and {labels[p.second]} share {p.common}" for p in crossing)
+    counts = ", ".join(f"{labels[i]} and {labels[j]} share {count}" for (i, j), count in common.items())
     return RigError(
         "cameras see too little in common to be placed in one rig",
         where="keypoints",
         got=f"{', '.join(cut_off)} cut off; {counts}",
-        expected=f"at least {min_common} common points, seen from different places, between some pair",
+        expected=f"at least {min_common} common points that fit one pose, between some pair",
         remedy="Use a longer session in which the athlete crosses the views of these cameras, or leave them out.",
     )

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 from dataclasses import dataclass
 
 import cv2
@@ -21,7 +20,7 @@ class RelativePose:
     rotation: Array
     translation: Array
     in_front: int
-    """inliers that lie in front of both cameras"""
+    """inliers looked at that lie in front of both cameras"""
 
     def inverse(self) -> RelativePose:
         """The pose of the first camera relative to the second."""
@@ -42,39 +41,45 @@ class Pair:
     """the four poses, the one with most points in front of both cameras first"""
 
 
-def relative_poses(
-    rays: Array, visible: NDArray[np.bool_], focal_px: Array, *, min_common: int, max_points: int, threshold_px: float
-) -> list[Pair]:
-    """Relate every two cameras with enough common points, by RANSAC over essential matrices.
+def relate(
+    rays: Array,
+    visible: NDArray[np.bool_],
+    focal_px: Array,
+    first: int,
+    second: int,
+    *,
+    max_points: int,
+    threshold_px: float,
+) -> Pair:
+    """Relate two cameras by RANSAC over essential matrices.
 
     Args:
         rays: undistorted, normalised coordinates (C, 2, N).
         visible: (C, N).
         focal_px: (C,), to express the threshold in normalised coordinates.
-        min_common: fewest common points of a pair.
-        max_points: points of a pair that RANSAC looks at, spread evenly over the session; all count for the inliers.
+        first: one camera.
+        second: the other.
+        max_points: points that RANSAC looks at, spread evenly over the session; all count for the inliers.
         threshold_px: distance from the epipolar line up to which a point is an inlier.
 
     Returns:
-        All pairs, also those with too few common points, which have no poses.
+        The pair; without poses where no essential matrix fits.
     """
-    pairs: list[Pair] = []
-    for first, second in itertools.combinations(range(len(rays)), 2):
-        columns = np.flatnonzero(visible[first] & visible[second])
-        if len(columns) < min_common:
-            pairs.append(Pair(first, second, len(columns), 0, ()))
-            continue
-        threshold = threshold_px / float(np.sqrt(focal_px[first] * focal_px[second]))
-        a, b = rays[first][:, columns], rays[second][:, columns]
-        sample = np.linspace(0, len(columns) - 1, min(max_points, len(columns))).astype(int)
-        essential = _essential_matrix(a[:, sample], b[:, sample], threshold)
-        if essential is None:
-            pairs.append(Pair(first, second, len(columns), 0, ()))
-            continue
-        inlier = _sampson_distance(essential, a, b) < threshold
-        poses = _decompose(essential, a[:, inlier], b[:, inlier])
-        pairs.append(Pair(first, second, len(columns), int(inlier.sum()), poses))
-    return pairs
+    columns = np.flatnonzero(visible[first] & visible[second])
+    threshold = threshold_px / float(np.sqrt(focal_px[first] * focal_px[second]))
+    a, b = rays[first][:, columns], rays[second][:, columns]
+    sample = spread(len(columns), max_points)
+    essential = _essential_matrix(a[:, sample], b[:, sample], threshold)
+    if essential is None:
+        return Pair(first, second, len(columns), 0, ())
+    inliers = np.flatnonzero(_sampson_distance(essential, a, b) < threshold)
+    sample = inliers[spread(len(inliers), max_points)]
+    return Pair(first, second, len(columns), len(inliers), _decompose(essential, a[:, sample], b[:, sample]))
+
+
+def spread(count: int, limit: int) -> NDArray[np.intp]:
+    """At most ``limit`` of the indices below ``count``, evenly spread."""
+    return np.linspace(0, count - 1, min(limit, count)).astype(np.intp)
 
 
 def two_view_depths(rotation: Array, translation: Array, a: Array, b: Array) -> tuple[Array, Array]:
