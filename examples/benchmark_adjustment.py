@@ -17,7 +17,7 @@ import platform
 import statistics
 import time
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -199,15 +199,8 @@ def scipy_trf(problem: Problem) -> Timing:
     x = np.concatenate([np.zeros(free), start.points.mT.reshape(-1).numpy()])
     began = time.perf_counter()
     with torch.no_grad():
-        found = least_squares(  # pyright: ignore[reportCallIssue]
-            residuals,
-            x,
-            jacobian,
-            x_scale="jac",
-            ftol=COST_TOLERANCE,
-            xtol=None,
-            gtol=None,  # pyright: ignore[reportArgumentType]
-        )
+        options: dict[str, Any] = {"x_scale": "jac", "ftol": COST_TOLERANCE, "xtol": None, "gtol": None}
+        found = least_squares(residuals, x, jacobian, **options)  # pyright: ignore[reportArgumentType]
     return Timing(time.perf_counter() - began, 2 * float(found.cost))
 
 

@@ -14,6 +14,7 @@ from torchstickcal.initialise import initialise
 from torchstickcal.initialise.graph import Edge, propagate, spanning_tree
 from torchstickcal.initialise.pairs import Pair, RelativePose, relate
 from torchstickcal.initialise.triangulate import triangulate
+from torchstickcal.initialise.views import Views
 from torchstickcal.problem import Measurements
 from torchstickcal.simulate import Noise, golf_session
 
@@ -61,18 +62,15 @@ def test_cut_off_cameras_are_named_with_their_counts():
 def test_a_third_view_tells_the_true_pose_from_its_twin():
     """With the points in front of both cameras outvoted in the first pair, the rig still comes out right."""
     observations, truth = golf_session(cameras=3, frames=30)
-    measurements = Measurements.of(observations)
-    rays = measurements.cameras.undistort(measurements.pixels.movedim(1, -1)).movedim(-1, 1).numpy()
-    visible = measurements.visible.numpy()
-    find = partial(relate, rays, visible, measurements.cameras.focal_px.numpy(), max_points=200, threshold_px=2.0)
-    common = visible.astype(int) @ visible.T.astype(int)
-    edges = spanning_tree(common, find, ["0", "1", "2"], 20)
+    views = Views(Measurements.of(observations))
+    find = partial(relate, views, max_points=200, threshold_px=2.0)
+    edges = spanning_tree(views.common(), find, ["0", "1", "2"], 20)
     first = edges[0]
     wrong_first = tuple(
         RelativePose(pose.rotation, pose.translation, count)
         for pose, count in zip(reversed(first.poses), (200, 190, 180, 180), strict=True)
     )
-    rotations, _ = propagate([Edge(first.parent, first.child, wrong_first), *edges[1:]], rays, visible, scale=0.02)
+    rotations, _ = propagate([Edge(first.parent, first.child, wrong_first), *edges[1:]], views, scale=0.02)
     relative = (truth.rotations @ truth.rotations[0].mT).numpy()
     assert np.abs(rotations - relative).max() < 0.05
 

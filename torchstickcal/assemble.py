@@ -29,10 +29,12 @@ def assemble(
     """
     state, used, sigma_px = stages[-1].state, stages[-1].measurements, stages[-1].sigma_px
     points = used.by_frame(state.points.where(used.active, torch.nan)).movedim(0, -1)
-    compared = (observations.visible & points.isfinite().all(-1))[..., None]
-    residuals = reprojection_residuals(
-        points, state.rotations, state.translations, observations.keypoints.double(), measurements.cameras
-    ).where(compared, torch.nan)
+    residuals = torch.empty_like(observations.keypoints, dtype=torch.float64)
+    for frames in used.frame_slices():
+        seen = (observations.visible[:, frames] & points[frames].isfinite().all(-1))[..., None]
+        keypoints = observations.keypoints[:, frames].double()
+        found = reprojection_residuals(points[frames], state.rotations, state.translations, keypoints, used.cameras)
+        residuals[:, frames] = found.where(seen, torch.nan)
     starts, ends = [stick.start for stick in observations.sticks], [stick.end for stick in observations.sticks]
     distortion, size, cameras = observations.distortion, observations.image_size, observations.num_cameras
 

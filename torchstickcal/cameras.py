@@ -60,6 +60,10 @@ class Intrinsics:
         distortion = None if self.distortion is None else self.distortion.to(*args, **kwargs)  # type: ignore[call-overload]
         return Intrinsics(self.matrix.to(*args, **kwargs), distortion, self.fisheye)  # type: ignore[call-overload]
 
+    def __getitem__(self, cameras: slice | list[int]) -> Intrinsics:
+        """Some of the cameras."""
+        return Intrinsics(self.matrix[cameras], None if self.distortion is None else self.distortion[cameras], self.fisheye)
+
     @property
     def focal_px(self) -> Tensor:
         """Mean focal length of each camera, (C,), pixels."""

@@ -11,6 +11,7 @@ from torchstickcal.problem import Measurements, State
 
 _CUT = 4.0
 _ROUNDS = 5
+_MAX_FRAMES = 2000
 _MEDIAN_CHI2_2 = 2 * math.log(2)
 _MIN_SIGMA_PX = 1e-4
 _MIN_ACCELERATION_M = 1e-5
@@ -23,17 +24,18 @@ def estimate_sigma_px(measurements: Measurements, state: State) -> Tensor:
     From the residuals of the adjustment: their second moment inside a cut of 4 standard deviations, corrected for the part
     cut off and for the three degrees of freedom each 3D point has taken. Estimates of single points are drawn towards
     their common value as far as their spread is explained by chance (an empirical-Bayes mean of log variances), so that
-    points that are alike are treated alike.
+    points that are alike are treated alike. Of a long session some thousand frames, evenly spread, are looked at.
     """
-    squared = measurements.by_frame(measurements.squared_residuals(state) * measurements.confidence)
+    measurements, state = measurements.sampled(state, _MAX_FRAMES)
     visible = measurements.by_frame(measurements.visible)
+    squared = measurements.by_frame(measurements.squared_residuals(state) * measurements.confidence).where(visible, torch.inf)
     variance = _first_guess(squared, visible)
     for _ in range(_ROUNDS):
         kept = visible & (squared <= _CUT**2 * variance)
         views = kept.sum(0)
         kept = kept & (views >= 2)
         freedom = (2 * kept.sum(0) - 3).clamp_min(0).sum(0).to(squared)
-        variance = (squared * kept).sum((0, 1)) / freedom.clamp_min(1) / _truncated_moment(_CUT)
+        variance = squared.where(kept, 0.0).sum((0, 1)) / freedom.clamp_min(1) / _truncated_moment(_CUT)
         variance = _draw_together(variance.clamp_min(_MIN_SIGMA_PX**2), freedom)
     return variance.sqrt()
 

@@ -67,10 +67,30 @@ class Measurements:
         confidence = self.confidence * kept
         return replace(self, confidence=confidence * ((confidence > 0).sum(0) >= 2))
 
+    def sampled(self, state: State, frames: int) -> tuple[Measurements, State]:
+        """At most so many frames, evenly spread over the session, of the measurements and of a state."""
+        if self.frames <= frames:
+            return self, state
+        chosen = torch.linspace(0, self.frames - 1, frames).round().long().to(self.pixels.device)
+
+        def pick(columns: Tensor) -> Tensor:
+            return self.by_frame(columns)[..., chosen, :].flatten(-2)
+
+        measurements = replace(self, pixels=pick(self.pixels), confidence=pick(self.confidence), frames=frames)
+        return measurements, replace(state, points=pick(state.points))
+
     def squared_residuals(self, state: State) -> Tensor:
-        """Squared distances (C, N) between projections and keypoints, square pixels; meaningless where not seen."""
-        x, y = self.cameras.project_components(*state.in_cameras().unbind(1))
-        return (x - self.pixels[:, 0]).square() + (y - self.pixels[:, 1]).square()
+        """Squared distances (C, N) between projections and keypoints, square pixels; meaningless where not seen.
+
+        Infinite behind a camera.
+        """
+        squared = torch.empty_like(self.confidence)
+        for columns in self.chunks():
+            x, y, z = state.in_cameras(columns).unbind(1)
+            px, py = self.cameras.project_components(x, y, z)
+            distance = (px - self.pixels[:, 0, columns]).square() + (py - self.pixels[:, 1, columns]).square()
+            squared[:, columns] = distance.where(z > 0, torch.inf)
+        return squared
 
     @cached_property
     def visible(self) -> Tensor:
@@ -103,6 +123,11 @@ class Measurements:
         first, last = columns.start or 0, total if columns.stop is None else columns.stop
         width = self.points_per_frame * max(1, _CHUNK_KEYPOINTS // (self.points_per_frame * cameras))
         return [slice(start, min(start + width, last)) for start in range(first, last, width)]
+
+    def frame_slices(self) -> list[slice]:
+        """The frames of each of :meth:`chunks`."""
+        points = self.points_per_frame
+        return [slice(columns.start // points, columns.stop // points) for columns in self.chunks()]
 
     def stick_lengths_m(self, points: Tensor) -> Tensor:
         """Lengths (F, S) of the sticks among points (3, N); NaN in frames where an end is not active."""

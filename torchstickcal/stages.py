@@ -140,7 +140,7 @@ def run_stage(
 def _agreeing(measurements: Measurements, state: State, limit_px: Tensor) -> Tensor:
     """(C, N), True where a keypoint lies within a limit (P,) of its point's projection, in front of the camera."""
     squared = measurements.by_frame(measurements.squared_residuals(state) * measurements.confidence)
-    return (squared <= limit_px.square()).flatten(1) & (state.in_cameras()[:, 2] > 0)
+    return (squared <= limit_px.square()).flatten(1)
 
 
 def _losses(stage: Stage, measurements: Measurements, state: State, sigma_px: Tensor) -> dict[str, Loss]:

@@ -10,8 +10,9 @@ import torch
 from numpy.typing import NDArray
 
 from torchstickcal.errors import RigError
-from torchstickcal.initialise.pairs import Array, Pair, RelativePose, spread, two_view_depths
+from torchstickcal.initialise.pairs import Pair, RelativePose, two_view_depths
 from torchstickcal.initialise.triangulate import triangulate
+from torchstickcal.initialise.views import Array, Views, spread
 
 _PLAUSIBLE_SHARE = 0.5
 _NEARLY_ALL = 0.9
@@ -64,7 +65,7 @@ def spanning_tree(
     return edges
 
 
-def propagate(edges: Sequence[Edge], rays: Array, visible: NDArray[np.bool_], scale: float) -> tuple[Array, Array]:
+def propagate(edges: Sequence[Edge], views: Views, scale: float) -> tuple[Array, Array]:
     """Poses of all cameras, world to camera, in the frame of the first; the first edge has length 1.
 
     A pose out of an essential matrix is one of four, and the count of points in front of both cameras does not always
@@ -75,13 +76,11 @@ def propagate(edges: Sequence[Edge], rays: Array, visible: NDArray[np.bool_], sc
 
     Args:
         edges: the tree, in order of growth.
-        rays: undistorted, normalised coordinates (C, 2, N).
-        visible: (C, N).
+        views: what the cameras see.
         scale: residual, in normalised coordinates, up to which a point supports a pose.
     """
-    columns = np.flatnonzero(visible.sum(0) >= 2)
-    columns = columns[spread(len(columns), _MAX_POINTS)]
-    rays, visible = rays[:, :, columns], visible[:, columns]
+    columns = np.flatnonzero(views.visible.any(0))
+    rays, visible = views.rays(list(range(len(views.visible))), columns[spread(len(columns), _MAX_POINTS)])
     first = edges[0].poses
     plausible = [pose for pose in first if pose.in_front >= _PLAUSIBLE_SHARE * first[0].in_front]
     trees = [_grow(root, edges, rays, visible, scale) for root in plausible]

@@ -6,11 +6,12 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from torchstickcal.initialise.views import Array, Views, spread
 
 _CONFIDENCE = 0.9999
+_MAX_COUNTED = 5000
+_MIN_POINTS = 8
 
 
 @dataclass(frozen=True)
@@ -34,52 +35,38 @@ class Pair:
     first: int
     second: int
     common: int
-    """points both cameras see, counted over all frames"""
+    """points both cameras see, over all frames"""
     inliers: int
     """those that agree with the essential matrix"""
     poses: tuple[RelativePose, ...]
     """the four poses, the one with most points in front of both cameras first"""
 
 
-def relate(
-    rays: Array,
-    visible: NDArray[np.bool_],
-    focal_px: Array,
-    first: int,
-    second: int,
-    *,
-    max_points: int,
-    threshold_px: float,
-) -> Pair:
+def relate(views: Views, first: int, second: int, *, max_points: int, threshold_px: float) -> Pair:
     """Relate two cameras by RANSAC over essential matrices.
 
     Args:
-        rays: undistorted, normalised coordinates (C, 2, N).
-        visible: (C, N).
-        focal_px: (C,), to express the threshold in normalised coordinates.
+        views: what the cameras see.
         first: one camera.
         second: the other.
-        max_points: points that RANSAC looks at, spread evenly over the session; all count for the inliers.
+        max_points: points that RANSAC looks at, spread evenly over the session; some thousand count for the inliers.
         threshold_px: distance from the epipolar line up to which a point is an inlier.
 
     Returns:
         The pair; without poses where no essential matrix fits.
     """
-    columns = np.flatnonzero(visible[first] & visible[second])
-    threshold = threshold_px / float(np.sqrt(focal_px[first] * focal_px[second]))
-    a, b = rays[first][:, columns], rays[second][:, columns]
-    sample = spread(len(columns), max_points)
+    columns = np.flatnonzero(views.visible[first] & views.visible[second])
+    (a, b), seen = views.rays([first, second], columns[spread(len(columns), _MAX_COUNTED)])
+    a, b = a[:, seen.all(0)], b[:, seen.all(0)]
+    threshold = threshold_px / float(np.sqrt(views.focal_px[first] * views.focal_px[second]))
+    sample = spread(a.shape[1], max_points)
     essential = _essential_matrix(a[:, sample], b[:, sample], threshold)
     if essential is None:
         return Pair(first, second, len(columns), 0, ())
     inliers = np.flatnonzero(_sampson_distance(essential, a, b) < threshold)
     sample = inliers[spread(len(inliers), max_points)]
-    return Pair(first, second, len(columns), len(inliers), _decompose(essential, a[:, sample], b[:, sample]))
-
-
-def spread(count: int, limit: int) -> NDArray[np.intp]:
-    """At most ``limit`` of the indices below ``count``, evenly spread."""
-    return np.linspace(0, count - 1, min(limit, count)).astype(np.intp)
+    count = round(len(columns) * len(inliers) / a.shape[1])
+    return Pair(first, second, len(columns), count, _decompose(essential, a[:, sample], b[:, sample]))
 
 
 def two_view_depths(rotation: Array, translation: Array, a: Array, b: Array) -> tuple[Array, Array]:
@@ -94,6 +81,8 @@ def two_view_depths(rotation: Array, translation: Array, a: Array, b: Array) -> 
 
 
 def _essential_matrix(a: Array, b: Array, threshold: float) -> Array | None:
+    if a.shape[1] < _MIN_POINTS:
+        return None
     essential, _ = cv2.findEssentialMat(
         np.ascontiguousarray(a.T), np.ascontiguousarray(b.T), np.eye(3), cv2.USAC_ACCURATE, _CONFIDENCE, threshold
     )

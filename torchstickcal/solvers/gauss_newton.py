@@ -92,7 +92,7 @@ def _descend(
                 damping = max(damping * _LOOSEN, _MIN_DAMPING)
                 continue
             candidate = state.retracted(step.cameras, step.points) if len(step.cameras) else state.moved(step.points)
-            reached = linearise(objective, candidate, cameras_free)
+            reached = linearise(objective, candidate, cameras_free, replaced=system)
             decrease = system.cost - reached.cost
             if decrease > 0:
                 agreement = decrease / step.predicted_decrease
@@ -100,6 +100,7 @@ def _descend(
                 return _Move(candidate, reached, step, max(damping * factor, _MIN_DAMPING))
             if step.predicted_decrease <= termination.cost_tolerance * system.cost:
                 return Stop.COST
+            system = linearise(objective, state, cameras_free, replaced=reached)
         refused = True
         damping = max(damping, 1e-8) * 10
     return Stop.DIVERGED

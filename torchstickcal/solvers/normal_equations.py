@@ -182,13 +182,16 @@ class NormalEquations:
         return PointElimination(by_frame, m.pairs, coupling)
 
 
-def linearise(objective: Objective, state: State, cameras_free: bool) -> NormalEquations:
+def linearise(
+    objective: Objective, state: State, cameras_free: bool, replaced: NormalEquations | None = None
+) -> NormalEquations:
     """Build the Gauss-Newton system of an objective at a state.
 
     Args:
         objective: the losses on their session.
         state: where.
         cameras_free: whether the cameras are unknowns; the first one never is.
+        replaced: a system of the same objective that is not needed any more, whose largest array may be overwritten.
     """
     m = objective.measurements
     free = slice(1, None) if cameras_free else slice(0, 0)
@@ -197,7 +200,7 @@ def linearise(objective: Objective, state: State, cameras_free: bool) -> NormalE
     points = state.points
     costs = {name: points.new_zeros(()) for name in objective.losses}
     squares, weights = points.new_zeros(cameras), points.new_zeros(cameras)
-    cross = points.new_empty(count, 6, total)
+    cross = points.new_empty(count, 6, total) if replaced is None else replaced.cross
     point_hessian, point_gradient = points.new_empty(6, total), points.new_empty(3, total)
     gradient_moments, hessian_moments = points.new_zeros(3 * count, 4), points.new_zeros(6 * count, 10)
     for columns in m.chunks():
