@@ -8,11 +8,26 @@ import sys
 from pathlib import Path
 
 import pytest
+import torch
 
-from torchstickcal import Calibration
+from torchstickcal import Calibration, calibrate
 from torchstickcal.cli import main
 from torchstickcal.io import read_camera_toml, write_npz
 from torchstickcal.simulate import Noise, golf_session
+
+
+@pytest.fixture(autouse=True)
+def threads():
+    """The command line sets torch's threads for its own process; here they are put back."""
+    count = torch.get_num_threads()
+    yield
+    torch.set_num_threads(count)
+
+
+def test_calibrating_leaves_torchs_threads_alone(noisy):
+    count = torch.get_num_threads()
+    calibrate(noisy[0])
+    assert torch.get_num_threads() == count
 
 
 @pytest.fixture
@@ -90,6 +105,7 @@ def test_the_same_command_writes_the_same_cameras(session: Path, tmp_path: Path)
         (["calibrate", "absent.npz", "--out", "out"], "No such file"),
         (["calibrate", "SESSION", "--out", "out", "--config", "papr"], "Did you mean 'paper'"),
         (["calibrate", "SESSION", "--out", "out", "--stick-length", "1150"], "millimetres"),
+        (["calibrate", "SESSION", "--out", "out", "--threads", "0"], "no threads"),
         (["evaluate", "SESSION", "FOUR"], "number of cameras differs"),
         (["benchmark", "EMPTY"], "no sessions"),
     ],

@@ -75,6 +75,13 @@ def _parser() -> argparse.ArgumentParser:
 
 def _add_config(command: argparse.ArgumentParser) -> None:
     command.add_argument("--config", metavar="NAME|FILE", default="default", help="a configuration (default: default)")
+    command.add_argument(
+        "--threads",
+        metavar="N",
+        type=int,
+        default=1,
+        help="threads of torch (default: 1, which is hardly slower and does not stall beside other programs)",
+    )
 
 
 def _calibrate(options: argparse.Namespace) -> int:
@@ -82,6 +89,7 @@ def _calibrate(options: argparse.Namespace) -> int:
     from torchstickcal.io import read_session
     from torchstickcal.pipeline import calibrate
 
+    _use_threads(options.threads)
     config = load_config(options.config)
     observations, _ = read_session(options.session)
     if options.stick_length is not None:
@@ -123,6 +131,7 @@ def _benchmark(options: argparse.Namespace) -> int:
     from torchstickcal.benchmark import score_sequence, session_files, summarise
     from torchstickcal.config import load_config
 
+    _use_threads(options.threads)
     config = load_config(options.config)
     files = session_files(options.folder)
     width = max(len(file.stem) for file in files)
@@ -198,6 +207,14 @@ class _Progress:
             print(f"\r{'':<70}\r", end="", file=sys.stderr, flush=True)
         if self._following:
             self._following.on_end(calibration)
+
+
+def _use_threads(count: int) -> None:
+    import torch
+
+    if count < 1:
+        raise CalibrationError("no threads to compute with", where="--threads", got=count, expected="1 or more")
+    torch.set_num_threads(count)
 
 
 def _monitor(log_dir: Path | None) -> Callback | None:
