@@ -13,7 +13,7 @@ _RELATIVE_PIVOT_FLOOR = 1e-13
 
 
 def expand(entries: Tensor) -> Tensor:
-    """Symmetric matrices (3, 3, N) of their six distinct entries (6, N)."""
+    """Symmetric matrices (3, 3, ...) of their six distinct entries (6, ...)."""
     xx, xy, xz, yy, yz, zz = entries
     return torch.stack([xx, xy, xz, xy, yy, yz, xz, yz, zz]).unflatten(0, (3, 3))
 

@@ -7,6 +7,7 @@ what is left is block tridiagonal again with half as many blocks. Stick ends for
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Iterator
 from typing import NamedTuple
 
@@ -81,6 +82,13 @@ def _inverse_factor(blocks: Tensor) -> Tensor:
     return torch.linalg.solve_triangular(torch.linalg.cholesky(blocks), identity, upper=False)
 
 
+class _Part(NamedTuple):
+    """Tracks that are eliminated together: their points (T, 1), or pairs of points (T, 2) with their coupling (6, F, T)."""
+
+    members: Tensor
+    between: Tensor | None
+
+
 class TrackElimination:
     """Cholesky factor of the structure's Hessian with coupling over time.
 
@@ -95,40 +103,48 @@ class TrackElimination:
     def __init__(
         self, hessian: Tensor, pairs: Tensor, coupling: Tensor | None, next_frame: Tensor, second_frame: Tensor
     ) -> None:
+        self._hessian, self._next_frame, self._second_frame = hessian, next_frame, second_frame
         _, self._frames, self._points = hessian.shape
         paired = torch.zeros(self._points, dtype=torch.bool, device=hessian.device)
         paired[pairs.flatten()] = coupling is not None
-        self._groups: list[Tensor] = []
-        self._factors: list[BlockTridiagonal] = []
-        blocks = expand(hessian.flatten(1)).unflatten(-1, hessian.shape[1:])
         together = max(1, _PART_POINTS // self._frames)
-        parts = [(members, None) for members in (~paired).nonzero().split(together)]
+        self._parts = [_Part(members, None) for members in (~paired).nonzero().split(together)]
         if coupling is not None:
-            parts += list(zip(pairs.split(together), coupling.split(together, dim=-1), strict=True))
-        for members, between in parts:
-            diagonal = self._diagonal(blocks, members, between)
-            steps = [self._by_track(step.expand(3, -1, -1), members)[..., 0] for step in (next_frame, second_frame)]
-            self._groups.append(members)
-            self._factors.append(BlockTridiagonal(*_two_frames_a_block(diagonal, *steps)))
+            sticks = zip(pairs.split(together), coupling.split(together, dim=-1), strict=True)
+            self._parts += [_Part(members, between) for members, between in sticks]
+        self._factors: list[BlockTridiagonal] = []
 
     def reductions(self, cross: Tensor, points: Tensor, gradient: Tensor) -> Iterator[tuple[Tensor, Tensor]]:
         """``(L^-1 H_xc)^T`` and ``L^-1 g`` of :class:`PointElimination`, the unknowns in the order of elimination."""
-        for members, factor in zip(self._groups, self._factors, strict=True):
-            columns = self._columns(members)
+        self._factors = []
+        for part in self._parts:
+            self._factors.append(self._factor(part))
+            columns = self._columns(part.members)
             rows = cross_rows(cross[:, :, columns], points[:, columns]).permute(2, 0, 1, 3).flatten(1, 2)
-            half = factor.half_solve(self._blocks(torch.cat([rows, gradient[:, None, columns]], dim=1), members))
-            solved = torch.cat([level.flatten(0, -2) for level in half]).mT
+            rhs = self._blocks(torch.cat([rows, gradient[:, None, columns]], dim=1), part.members)
+            solved = torch.cat([level.flatten(0, -2) for level in self._factors[-1].half_solve(rhs)]).mT
             yield solved[:-1], solved[-1]
 
     def solve(self, rhs: Tensor) -> Tensor:
-        """``H^-1 b`` of a right-hand side (3, N)."""
+        """``H^-1 b`` of a right-hand side (3, N), with the factors of :meth:`reductions` where it has been called."""
         solution = torch.empty_like(rhs)
-        for members, factor in zip(self._groups, self._factors, strict=True):
-            columns = self._columns(members)
-            half = factor.half_solve(self._blocks(rhs[:, None, columns], members))
-            tracks = factor.back_solve(half).flatten(1)[:, : 3 * members.shape[1] * self._frames]
+        for part, factor in itertools.zip_longest(self._parts, self._factors):
+            factor = factor or self._factor(part)
+            columns = self._columns(part.members)
+            half = factor.half_solve(self._blocks(rhs[:, None, columns], part.members))
+            tracks = factor.back_solve(half).flatten(1)[:, : 3 * part.members.shape[1] * self._frames]
             solution[:, columns] = tracks.reshape(-1, 3).mT
         return solution
+
+    def _factor(self, part: _Part) -> BlockTridiagonal:
+        members = part.members
+        first, *second = (expand(self._hessian[..., ends]).permute(3, 2, 0, 1) for ends in members.unbind(1))
+        diagonal = first
+        if part.between is not None:
+            between = -expand(part.between).permute(3, 2, 0, 1)
+            diagonal = torch.cat([torch.cat([first, between], -1), torch.cat([between, second[0]], -1)], -2)
+        steps = (step[:, members].permute(1, 0, 2).repeat_interleave(3, -1) for step in (self._next_frame, self._second_frame))
+        return BlockTridiagonal(*_two_frames_a_block(diagonal, *steps))
 
     def _columns(self, members: Tensor) -> Tensor:
         """Columns of the points of tracks (T, q), ordered track, frame, member."""
@@ -140,21 +156,6 @@ class TrackElimination:
         tracks = rhs.flatten(0, 1).mT.contiguous().view(len(members), self._frames, -1, rhs.shape[1])
         padded = torch.nn.functional.pad(tracks, (0, 0, 0, 0, 0, 1)) if self._frames % 2 else tracks
         return padded.unflatten(1, (-1, 2)).flatten(2, 3)
-
-    @staticmethod
-    def _by_track(values: Tensor, members: Tensor) -> Tensor:
-        """Values (3, F, P) at the members (T, q) of the tracks, as (T, F, 3 q, 1)."""
-        return values[:, :, members].permute(2, 1, 3, 0).flatten(2)[..., None]
-
-    @staticmethod
-    def _diagonal(blocks: Tensor, members: Tensor, coupling: Tensor | None) -> Tensor:
-        """Blocks (T, F, m, m) of the tracks, of point blocks (3, 3, F, P)."""
-        first = blocks[..., members[:, 0]].permute(3, 2, 0, 1)
-        if coupling is None:
-            return first
-        second = blocks[..., members[:, 1]].permute(3, 2, 0, 1)
-        between = -expand(coupling.flatten(1)).unflatten(-1, coupling.shape[1:]).permute(3, 2, 0, 1)
-        return torch.cat([torch.cat([first, between], -1), torch.cat([between, second], -1)], -2)
 
 
 def _two_frames_a_block(diagonal: Tensor, next_frame: Tensor, second_frame: Tensor) -> tuple[Tensor, Tensor]:
