@@ -8,6 +8,7 @@ Kannala and Brandt (4 coefficients). Both have a symmetric 2 x 2 Jacobian, kept 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import NamedTuple
 
 import torch
@@ -144,7 +145,7 @@ class Intrinsics:
             if not bool((torch.maximum(error_u.abs(), error_v.abs()) > _UNDISTORT_TOLERANCE).any()):
                 break
         back_u, back_v = self.distort(u, v)
-        fold_radius = self._fold_radius().view(-1, *[1] * (u.ndim - 1))
+        fold_radius = self._fold_radius.view(-1, *[1] * (u.ndim - 1))
         solved = ((back_u - u_target).abs() + (back_v - v_target).abs() < 1e-9) & (u * u + v * v < fold_radius**2)
         return torch.where(solved[..., None], torch.stack([u, v], dim=-1), torch.nan)
 
@@ -192,6 +193,7 @@ class Intrinsics:
         scale = theta_d / r
         return scale, (slope / (1 + r2) - scale) / r2
 
+    @cached_property
     def _fold_radius(self) -> Tensor:
         """Normalised radius (C,) up to which the radial model is one-to-one."""
         radii = torch.linspace(0, _FOLD_SEARCH_RADIUS, _FOLD_SEARCH_STEPS, dtype=self.matrix.dtype)

@@ -10,7 +10,7 @@ import numpy as np
 from torchstickcal.initialise.views import Array, Views, spread
 
 _CONFIDENCE = 0.9999
-_MAX_COUNTED = 5000
+_MAX_COUNTED = 1000
 _MIN_POINTS = 8
 
 
@@ -49,7 +49,7 @@ def relate(views: Views, first: int, second: int, *, max_points: int, threshold_
         views: what the cameras see.
         first: one camera.
         second: the other.
-        max_points: points that RANSAC looks at, spread evenly over the session; some thousand count for the inliers.
+        max_points: points that RANSAC looks at, spread evenly over the session; a thousand count for the inliers.
         threshold_px: distance from the epipolar line up to which a point is an inlier.
 
     Returns:

@@ -9,6 +9,9 @@ from torchstickcal.problem import Measurements
 
 Array = NDArray[np.float64]
 
+_UNDISTORTED_AT_ONCE = 500_000
+"""Keypoints of a session up to which all are undistorted once, instead of each sample when it is looked at."""
+
 
 class Views:
     """Access to the keypoints of a session without holding them twice.
@@ -23,6 +26,7 @@ class Views:
         """(C, N)"""
         self.focal_px: Array = measurements.cameras.focal_px.cpu().numpy()
         """(C,)"""
+        self._whole = self._undistorted(slice(None), slice(None)) if self.visible.size <= _UNDISTORTED_AT_ONCE else None
 
     def common(self) -> NDArray[np.int_]:
         """The number of points two cameras have in common, (C, C)."""
@@ -34,11 +38,14 @@ class Views:
 
         A keypoint beyond the fold of its lens counts as not seen.
         """
+        whole = self._whole
+        rays = self._undistorted(cameras, columns) if whole is None else whole[cameras][:, :, columns]
+        return np.nan_to_num(rays), self.visible[cameras][:, columns] & np.isfinite(rays).all(1)
+
+    def _undistorted(self, cameras: list[int] | slice, columns: NDArray[np.intp] | slice) -> Array:
         m = self._measurements
         pixels = m.pixels[cameras][:, :, columns].movedim(1, -1)
-        rays = m.cameras[cameras].undistort(pixels).movedim(-1, 1).cpu().numpy()
-        seen = self.visible[cameras][:, columns] & np.isfinite(rays).all(1)
-        return np.nan_to_num(rays), seen
+        return m.cameras[cameras].undistort(pixels).movedim(-1, 1).cpu().numpy()
 
 
 def spread(count: int, limit: int) -> NDArray[np.intp]:

@@ -39,7 +39,7 @@ class Termination:
 
     max_iterations: int = 100
     cost_tolerance: float = 1e-9
-    camera_tolerance: float = 1e-5
+    camera_tolerance: float = 1e-4
 
 
 @dataclass(frozen=True)
