@@ -58,6 +58,31 @@ def test_calibrate_then_evaluate(session: Path, tmp_path: Path, capsys: pytest.C
     assert main(["evaluate", str(out), str(out)]) == 0
 
 
+def test_cameras_are_matched_by_name(session: Path, tmp_path: Path):
+    out = tmp_path / "results"
+    main(["calibrate", str(session), "--out", str(out)])
+    first, second, third, metadata = (out / "calibration.toml").read_text().split("\n\n")
+    tables = [table.split("\n", 1)[1] for table in (third, first, second)]
+    renamed = [f"[cam_{number}]\n{table}" for number, table in enumerate(tables)]
+    (tmp_path / "shuffled.toml").write_text("\n\n".join([*renamed, metadata]))
+    main(["evaluate", str(tmp_path / "shuffled.toml"), str(out), "--json", str(tmp_path / "e.json")])
+    errors = json.loads((tmp_path / "e.json").read_text())
+    assert errors["mean_translation_m"] < 1e-12
+    assert [camera["name"] for camera in errors["cameras"]] == ["cam03", "cam01", "cam02"]
+
+
+def test_benchmark_scores_what_it_cannot_read_as_failed(session: Path, tmp_path: Path):
+    folder = tmp_path / "sessions"
+    folder.mkdir()
+    session.rename(folder / session.name)
+    (folder / "broken.pkl").write_bytes(b"\x80\x04 nonsense")
+    assert main(["benchmark", str(folder), "--json", str(tmp_path / "b.json")]) == 1
+    broken, swing = json.loads((tmp_path / "b.json").read_text())["sequences"]
+    assert broken["rotation_deg"] is None
+    assert "damaged" in broken["status"]
+    assert swing["status"] == "converged"
+
+
 def test_stick_length_scales_the_rig(session: Path, tmp_path: Path):
     for length in ("1.0", "2.0"):
         main(["calibrate", str(session), "--out", str(tmp_path / length), "--stick-length", length])

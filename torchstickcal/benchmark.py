@@ -43,13 +43,12 @@ def session_files(folder: Path) -> list[Path]:
 def score_sequence(path: Path, config: Config) -> SequenceScore | None:
     """Calibrate a session and compare with its truth; None if it carries none.
 
-    Raises:
-        CalibrationError: if the file is not a usable session.
+    A session that cannot be read or calibrated is scored without errors, its status saying why.
     """
-    observations, truth = read_session(path)
-    if truth is None:
-        return None
     try:
+        observations, truth = read_session(path)
+        if truth is None:
+            return None
         calibration = calibrate(observations, config)
     except CalibrationError as error:
         return SequenceScore(path.stem, None, None, 0.0, f"{type(error).__name__}: {error}")

@@ -100,17 +100,22 @@ def _calibrate(options: argparse.Namespace) -> int:
 
 
 def _evaluate(options: argparse.Namespace) -> int:
+    """Cameras are matched by name where both sides have the same names, else by their order."""
+    from torchstickcal.io import Truth
     from torchstickcal.metrics import pose_errors
 
     names, estimate = _poses(options.calibration)
-    _, truth = _poses(options.truth)
-    if len(estimate.rotations) != len(truth.rotations):
+    truth_names, truth = _poses(options.truth)
+    if len(names) != len(truth_names):
         raise CalibrationError(
             "the number of cameras differs",
             where=str(options.truth),
-            got=f"{len(truth.rotations)} cameras",
-            expected=f"{len(estimate.rotations)} as in {options.calibration}",
+            got=f"{len(truth_names)} cameras",
+            expected=f"{len(names)} as in {options.calibration}",
         )
+    if set(names) == set(truth_names):
+        order = [truth_names.index(name) for name in names]
+        truth = Truth(truth.rotations[order], truth.translations[order])
     errors = pose_errors(estimate.rotations, estimate.translations, truth.rotations, truth.translations)
     result = {
         "mean_rotation_deg": errors.mean_rotation_deg,
