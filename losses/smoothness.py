@@ -10,8 +10,19 @@ from torchstickcal.losses.base import TrackLoss, TrackTerms
 
 def second_differences(points: Tensor) -> Tensor:
     """``X[f-1] - 2 X[f] + X[f+1]``, (F - 2, P, 3), of points (F, P, 3); zero where one of the three is NaN."""
-    difference = points[2:] - 2 * points[1:-1] + points[:-2]
+    difference = stencil(points, dim=0)
     return torch.where(difference.isfinite().all(-1, keepdim=True), difference, torch.zeros_like(difference))
+
+
+def stencil(values: Tensor, dim: int) -> Tensor:
+    """``v[f-1] - 2 v[f] + v[f+1]`` along the dimension of the frames, two frames shorter."""
+    v = values.movedim(dim, 0)
+    return (v[2:] - 2 * v[1:-1] + v[:-2]).movedim(0, dim)
+
+
+def complete_triples(present: Tensor) -> Tensor:
+    """(F - 2, ...), True where a point is present in three frames in a row, of a mask (F, ...)."""
+    return present[2:] & present[1:-1] & present[:-2]
 
 
 class SmoothnessLoss(TrackLoss):
@@ -25,15 +36,13 @@ class SmoothnessLoss(TrackLoss):
 
     def forward(self, points: Tensor) -> Tensor:
         """The loss of points (F, P, 3); NaN points take no part."""
-        present = points.isfinite().all(-1, keepdim=True)
-        safe = points.nan_to_num()
-        complete = (present[2:] & present[1:-1] & present[:-2])[..., 0]
-        squared = second_differences(safe).square().sum(-1) * complete
+        complete = complete_triples(points.isfinite().all(-1))
+        squared = second_differences(points.nan_to_num()).square().sum(-1) * complete
         return self.total(squared * self.information(squared))
 
     def linearise(self, points: Tensor, active: Tensor) -> TrackTerms:
-        complete = active[2:] & active[1:-1] & active[:-2]
-        difference = (points[:, 2:] - 2 * points[:, 1:-1] + points[:, :-2]) * complete
+        complete = complete_triples(active)
+        difference = stencil(points, dim=1) * complete
         squared = difference.square().sum(0) * self.information(difference)
         scale = (self.weight * self.information(difference) * self.kernel.weight(squared)).sqrt() * complete
         return TrackTerms(cost=self.total(squared), residual=difference * scale, scale=scale)

@@ -42,7 +42,7 @@ def test_spanning_tree_takes_the_strongest_pairs_and_relates_no_more_than_it_mus
 
     def relate(first: int, second: int) -> Pair:
         asked.append((first, second))
-        return Pair(first, second, int(common[first, second]), inliers[first, second], (pose,))
+        return Pair(int(common[first, second]), inliers[first, second], (pose,))
 
     edges = spanning_tree(common, relate, ["a", "b", "c", "d"], 20)
     assert [(edge.parent, edge.child) for edge in edges] == [(0, 1), (1, 2), (2, 3)]

@@ -30,7 +30,7 @@ def test_points_of_different_noise_are_told_apart_and_alike_ones_are_treated_ali
         measurements = Measurements.of(observations)
         measurements = Measurements(pixels, measurements.confidence, *list(vars(measurements).values())[2:])
         state = State(truth.rotations, truth.translations, truth.points.flatten(0, 1).mT.contiguous())
-        return estimate_sigma_px(measurements, state)
+        return estimate_sigma_px(measurements, measurements.squared_residuals(state))
 
     alike = estimated(sigma)
     assert alike.max() / alike.min() < 1.02

@@ -1,9 +1,6 @@
 """Metric extrinsic calibration of multi-camera rigs from an athlete's keypoints and a stick of known length.
 
-from torchstickcal import Observations, Stick, calibrate
-
-observations = Observations(keypoints, intrinsics, Stick(start=19, end=20, length_m=1.0))
-calibration = calibrate(observations)
+The way in is :func:`calibrate` on :class:`Observations` with a :class:`Stick`; the README shows it in ten lines.
 """
 
 from __future__ import annotations

@@ -81,13 +81,12 @@ class Intrinsics:
 
     def pixels_with_jacobian(self, u: Tensor, v: Tensor) -> PixelMap:
         """Pixel coordinates of normalised coordinates (C, N), with their derivatives."""
-        fx, skew, cx, fy, cy = self._pixel_map(2)
+        fx, skew, _, fy, _ = self._pixel_map(2)
         if self.distortion is None:
             return PixelMap(*self._to_pixels(u, v), fx, skew, torch.zeros_like(fx), fy)
         lens = self.distort_with_jacobian(u, v)
         return PixelMap(
-            x=fx * lens.u + skew * lens.v + cx,
-            y=fy * lens.v + cy,
+            *self._to_pixels(lens.u, lens.v),
             dx_du=fx * lens.du_du + skew * lens.du_dv,
             dx_dv=fx * lens.du_dv + skew * lens.dv_dv,
             dy_du=fy * lens.du_dv,

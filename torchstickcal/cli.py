@@ -13,6 +13,7 @@ from torchstickcal.errors import CalibrationError
 
 if TYPE_CHECKING:
     from torchstickcal.io import Truth
+    from torchstickcal.metrics import PoseErrors
     from torchstickcal.pipeline import Callback
     from torchstickcal.result import Calibration
     from torchstickcal.solvers import IterationRecord
@@ -117,16 +118,7 @@ def _evaluate(options: argparse.Namespace) -> int:
         order = [truth_names.index(name) for name in names]
         truth = Truth(truth.rotations[order], truth.translations[order])
     errors = pose_errors(estimate.rotations, estimate.translations, truth.rotations, truth.translations)
-    result = {
-        "mean_rotation_deg": errors.mean_rotation_deg,
-        "mean_translation_m": errors.mean_translation_m,
-        "cameras": [
-            {"name": name, "rotation_deg": rotation, "translation_m": translation}
-            for name, rotation, translation in zip(
-                names, errors.rotation_deg.tolist(), errors.translation_m.tolist(), strict=True
-            )
-        ],
-    }
+    result = _errors_by_camera(names, errors)
     _print_errors(result)
     _write_json(options.json, result)
     return EXIT_DONE
@@ -182,14 +174,7 @@ def _demo(options: argparse.Namespace) -> int:
     status = _show(calibration, options.out)
     print(f"picture in {options.out / 'rig.png'}\n\nAgainst the truth:")
     errors = pose_errors(calibration.rotations, calibration.translations, truth.rotations, truth.translations)
-    rows = zip(calibration.camera_names, errors.rotation_deg.tolist(), errors.translation_m.tolist(), strict=True)
-    _print_errors(
-        {
-            "mean_rotation_deg": errors.mean_rotation_deg,
-            "mean_translation_m": errors.mean_translation_m,
-            "cameras": [{"name": n, "rotation_deg": r, "translation_m": t} for n, r, t in rows],
-        }
-    )
+    _print_errors(_errors_by_camera(calibration.camera_names, errors))
     return status
 
 
@@ -266,6 +251,16 @@ def _poses(path: Path) -> tuple[tuple[str, ...], Truth]:
             "a session without truth", where=str(file), got="no rotation", expected="rotation and translation"
         )
     return tuple(map(observations.camera_label, range(observations.num_cameras))), truth
+
+
+def _errors_by_camera(names: Sequence[str], errors: PoseErrors) -> dict[str, Any]:
+    """The errors as JSON can hold them."""
+    rows = zip(names, errors.rotation_deg.tolist(), errors.translation_m.tolist(), strict=True)
+    return {
+        "mean_rotation_deg": errors.mean_rotation_deg,
+        "mean_translation_m": errors.mean_translation_m,
+        "cameras": [{"name": n, "rotation_deg": rotation, "translation_m": translation} for n, rotation, translation in rows],
+    }
 
 
 def _print_errors(errors: dict[str, Any]) -> None:

@@ -7,7 +7,8 @@ import math
 import torch
 from torch import Tensor
 
-from torchstickcal.problem import Measurements, State
+from torchstickcal.losses.smoothness import complete_triples, stencil
+from torchstickcal.problem import Measurements
 
 _CUT = 4.0
 _ROUNDS = 5
@@ -18,17 +19,21 @@ _MIN_ACCELERATION_M = 1e-5
 _DISCERNIBLE_SHARE = 0.01
 
 
-def estimate_sigma_px(measurements: Measurements, state: State) -> Tensor:
+def estimate_sigma_px(measurements: Measurements, squared_residuals: Tensor) -> Tensor:
     """Standard deviation of a keypoint along each axis, (P,), pixels, for every point of the skeleton and the sticks.
 
     From the residuals of the adjustment: their second moment inside a cut of 4 standard deviations, corrected for the part
     cut off and for the three degrees of freedom each 3D point has taken. Estimates of single points are drawn towards
     their common value as far as their spread is explained by chance (an empirical-Bayes mean of log variances), so that
     points that are alike are treated alike. Of a long session some thousand frames, evenly spread, are looked at.
+
+    Args:
+        measurements: the session.
+        squared_residuals: (C, N), of :meth:`Measurements.squared_residuals`.
     """
-    measurements, state = measurements.sampled(state, _MAX_FRAMES)
-    visible = measurements.by_frame(measurements.visible)
-    squared = measurements.by_frame(measurements.squared_residuals(state) * measurements.confidence).where(visible, torch.inf)
+    frames = torch.linspace(0, measurements.frames - 1, min(measurements.frames, _MAX_FRAMES)).round().long()
+    visible = measurements.by_frame(measurements.visible)[:, frames]
+    squared = measurements.by_frame(squared_residuals)[:, frames]
     variance = _first_guess(squared, visible)
     for _ in range(_ROUNDS):
         kept = visible & (squared <= _CUT**2 * variance)
@@ -51,10 +56,9 @@ def estimate_acceleration_m(measurements: Measurements, points: Tensor, point_co
         points: (3, N).
         point_covariance: mean variance along the axes of each point as triangulated, (N,), square metres.
     """
-    active = measurements.by_frame(measurements.active)
-    complete = active[2:] & active[1:-1] & active[:-2]
+    complete = complete_triples(measurements.by_frame(measurements.active))
     x, noise = measurements.by_frame(points), measurements.by_frame(point_covariance)
-    measured = (x[:, 2:] - 2 * x[:, 1:-1] + x[:, :-2]).square().mean(0)
+    measured = stencil(x, dim=1).square().mean(0)
     expected = noise[2:] + 4 * noise[1:-1] + noise[:-2]
     weights = complete / expected.clamp_min(_MIN_ACCELERATION_M**2)
     total = weights.sum(0).clamp_min(1e-300)

@@ -59,8 +59,8 @@ def calibrate(
     seconds = {"initialise": time.perf_counter() - began}
 
     stages: list[StageResult] = []
+    listener = callback.on_iteration if callback else _ignore
     for name, stage in settings.stages.items():
-        listener = callback.on_iteration if callback else _ignore
         stages.append(run_stage(name, stage, measurements, state, known, settings.solver, listener))
         state = stages[-1].state
         seconds[name] = stages[-1].record.seconds

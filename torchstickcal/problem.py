@@ -67,29 +67,18 @@ class Measurements:
         confidence = self.confidence * kept
         return replace(self, confidence=confidence * ((confidence > 0).sum(0) >= 2))
 
-    def sampled(self, state: State, frames: int) -> tuple[Measurements, State]:
-        """At most so many frames, evenly spread over the session, of the measurements and of a state."""
-        if self.frames <= frames:
-            return self, state
-        chosen = torch.linspace(0, self.frames - 1, frames).round().long().to(self.pixels.device)
-
-        def pick(columns: Tensor) -> Tensor:
-            return self.by_frame(columns)[..., chosen, :].flatten(-2)
-
-        measurements = replace(self, pixels=pick(self.pixels), confidence=pick(self.confidence), frames=frames)
-        return measurements, replace(state, points=pick(state.points))
-
     def squared_residuals(self, state: State) -> Tensor:
-        """Squared distances (C, N) between projections and keypoints, square pixels; meaningless where not seen.
+        """Squared distances (C, N) between projections and keypoints, square pixels, times the keypoint's confidence.
 
-        Infinite behind a camera.
+        Infinite where a keypoint is not seen or its point lies behind the camera.
         """
         squared = torch.empty_like(self.confidence)
         for columns in self.chunks():
             x, y, z = state.in_cameras(columns).unbind(1)
             px, py = self.cameras.project_components(x, y, z)
             distance = (px - self.pixels[:, 0, columns]).square() + (py - self.pixels[:, 1, columns]).square()
-            squared[:, columns] = distance.where(z > 0, torch.inf)
+            confidence = self.confidence[:, columns]
+            squared[:, columns] = (distance * confidence).where((confidence > 0) & (z > 0), torch.inf)
         return squared
 
     @cached_property
@@ -152,15 +141,12 @@ class State:
         return replace(self, translations=self.translations * factor, points=self.points * factor)
 
     def retracted(self, camera_step: Tensor, point_step: Tensor) -> State:
-        """The state after tangent steps (C - 1, 6) of all cameras but the first and steps (3, N) of the points."""
-        rotations, translations = self.rotations.clone(), self.translations.clone()
-        moved = se3.retract(self.rotations[1:], self.translations[1:], camera_step)
-        rotations[1:], translations[1:] = moved
+        """The state after tangent steps (C - 1, 6) of all cameras but the first, or (0, 6), and steps (3, N) of the points."""
+        rotations, translations = self.rotations, self.translations
+        if len(camera_step):
+            moved = se3.retract(rotations[1:], translations[1:], camera_step)
+            rotations, translations = torch.cat([rotations[:1], moved[0]]), torch.cat([translations[:1], moved[1]])
         return State(rotations, translations, self.points + point_step)
-
-    def moved(self, point_step: Tensor) -> State:
-        """The state after steps (3, N) of the points alone."""
-        return replace(self, points=self.points + point_step)
 
     def in_cameras(self, columns: slice = slice(None)) -> Tensor:
         """The points in every camera's frame, (C, 3, N)."""

@@ -49,13 +49,21 @@ def summary(calibration: Calibration) -> dict[str, Any]:
         "cameras": [
             {
                 "name": name,
-                "centre_m": calibration.camera_centres[index].tolist(),
-                "rotation": calibration.rotations[index].tolist(),
-                "translation_m": calibration.translations[index].tolist(),
-                "reprojection_median_px": float(calibration.reprojection_median_px[index]),
-                "keypoints": _keypoints_used(calibration)[index],
+                "centre_m": centre,
+                "rotation": rotation,
+                "translation_m": translation,
+                "reprojection_median_px": median_px,
+                "keypoints": keypoints,
             }
-            for index, name in enumerate(calibration.camera_names)
+            for name, centre, rotation, translation, median_px, keypoints in zip(
+                calibration.camera_names,
+                calibration.camera_centres.tolist(),
+                calibration.rotations.tolist(),
+                calibration.translations.tolist(),
+                calibration.reprojection_median_px.tolist(),
+                _keypoints_used(calibration),
+                strict=True,
+            )
         ],
         "points": [
             {"name": _point_name(calibration, index), "sigma_px": sigma}

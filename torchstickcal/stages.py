@@ -118,9 +118,11 @@ def run_stage(
 ) -> StageResult:
     """Run one stage from a state."""
     began = time.perf_counter()
-    sigma_px = estimate_sigma_px(measurements, state)
+    squared_residuals = measurements.squared_residuals(state)
+    sigma_px = estimate_sigma_px(measurements, squared_residuals)
     if stage.reject_sigmas is not None:
-        measurements = measurements.keeping(_agreeing(measurements, state, stage.reject_sigmas * sigma_px))
+        agreeing = measurements.by_frame(squared_residuals) <= (stage.reject_sigmas * sigma_px).square()
+        measurements = measurements.keeping(agreeing.flatten(1))
     objective = Objective(measurements, _losses(stage, measurements, state, sigma_px))
     outcome = solver(solver_name)(
         objective,
@@ -135,12 +137,6 @@ def run_stage(
         state = state.scaled(scale_factor(measurements, state.points, known))
     record = StageRecord(name, outcome.stop, time.perf_counter() - began, outcome.iterations)
     return StageResult(state, measurements, sigma_px, record)
-
-
-def _agreeing(measurements: Measurements, state: State, limit_px: Tensor) -> Tensor:
-    """(C, N), True where a keypoint lies within a limit (P,) of its point's projection, in front of the camera."""
-    squared = measurements.by_frame(measurements.squared_residuals(state) * measurements.confidence)
-    return (squared <= limit_px.square()).flatten(1)
 
 
 def _losses(stage: Stage, measurements: Measurements, state: State, sigma_px: Tensor) -> dict[str, Loss]:

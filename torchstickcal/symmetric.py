@@ -9,6 +9,12 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+DIAGONAL = [0, 3, 5]
+"""The entries on the diagonal."""
+
+IDENTITY = (1.0, 0.0, 0.0, 1.0, 0.0, 1.0)
+"""The entries of the identity."""
+
 _RELATIVE_PIVOT_FLOOR = 1e-13
 
 

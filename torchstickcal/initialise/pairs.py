@@ -32,8 +32,6 @@ class RelativePose:
 class Pair:
     """Two cameras that see common points."""
 
-    first: int
-    second: int
     common: int
     """points both cameras see, over all frames"""
     inliers: int
@@ -62,11 +60,11 @@ def relate(views: Views, first: int, second: int, *, max_points: int, threshold_
     sample = spread(a.shape[1], max_points)
     essential = _essential_matrix(a[:, sample], b[:, sample], threshold)
     if essential is None:
-        return Pair(first, second, len(columns), 0, ())
+        return Pair(len(columns), 0, ())
     inliers = np.flatnonzero(_sampson_distance(essential, a, b) < threshold)
     sample = inliers[spread(len(inliers), max_points)]
     count = round(len(columns) * len(inliers) / a.shape[1])
-    return Pair(first, second, len(columns), count, _decompose(essential, a[:, sample], b[:, sample]))
+    return Pair(len(columns), count, _decompose(essential, a[:, sample], b[:, sample]))
 
 
 def two_view_depths(rotation: Array, translation: Array, a: Array, b: Array) -> tuple[Array, Array]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from torchstickcal.symmetric import solve
+from torchstickcal.symmetric import IDENTITY, solve
 
 _MIN_DEPTH = 1e-3
 
@@ -38,7 +38,7 @@ def triangulate(
     products = torch.stack([xx, xy, xz, yy, yz, zz], dim=1)
     moments = (rows * targets[:, :, None]).sum(0)
     unseen = (weights > 0).sum(0) < 2
-    identity = products.new_tensor([1.0, 0, 0, 1, 0, 1])[:, None]
+    identity = products.new_tensor(IDENTITY)[:, None]
     current = weights
     points = rays.new_zeros(3, rays.shape[2])
     for _ in range(iterations):

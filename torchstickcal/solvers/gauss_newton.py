@@ -91,7 +91,7 @@ def _descend(
                     return Stop.COST
                 damping = max(damping * _LOOSEN, _MIN_DAMPING)
                 continue
-            candidate = state.retracted(step.cameras, step.points) if len(step.cameras) else state.moved(step.points)
+            candidate = state.retracted(step.cameras, step.points)
             reached = linearise(objective, candidate, cameras_free, replaced=system)
             decrease = system.cost - reached.cost
             if decrease > 0:

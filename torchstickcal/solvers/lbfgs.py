@@ -16,6 +16,7 @@ from torchstickcal.problem import State
 from torchstickcal.solvers.base import IterationRecord, Listener, Outcome, Stop, Termination
 from torchstickcal.solvers.normal_equations import NormalEquations, linearise
 from torchstickcal.solvers.point_elimination import PointElimination
+from torchstickcal.symmetric import DIAGONAL
 
 _ITERATIONS_A_ROUND = 100
 _DAMPING = 1e-6
@@ -26,7 +27,7 @@ class _ScaledUnknowns:
 
     def __init__(self, system: NormalEquations, start: State) -> None:
         hessian = system.point_hessian.clone()
-        hessian[[0, 3, 5]] *= 1 + _DAMPING
+        hessian[DIAGONAL] *= 1 + _DAMPING
         measurements = system.objective.measurements
         self._points = PointElimination(measurements.by_frame(hessian), measurements.pairs, None)
         self._cameras = torch.linalg.cholesky(system.reduced_system(_DAMPING)[0]).mT

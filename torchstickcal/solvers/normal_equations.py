@@ -24,7 +24,7 @@ from torchstickcal.solvers.base import IterationRecord
 from torchstickcal.solvers.cross_blocks import cross_rows, symmetric_times
 from torchstickcal.solvers.point_elimination import PointElimination
 from torchstickcal.solvers.track_elimination import TrackElimination
-from torchstickcal.symmetric import outer
+from torchstickcal.symmetric import DIAGONAL, IDENTITY, outer
 
 _ELIMINATED_COLUMNS = 30000
 
@@ -89,7 +89,7 @@ class NormalEquations:
         point_step = torch.empty_like(self.point_gradient)
         for columns, elimination in eliminations:
             point_step[:, columns] = -elimination.solve(self.point_gradient[:, columns] + self._carried(columns, camera_step))
-        diagonal = self.point_hessian[[0, 3, 5]]
+        diagonal = self.point_hessian[DIAGONAL]
         descent = -float((self.camera_gradient * camera_step).sum() + (self.point_gradient * point_step).sum())
         camera_diagonal = self.camera_hessian.diagonal(dim1=1, dim2=2)
         held = damping * float((camera_diagonal * camera_step**2).sum() + (diagonal * point_step**2).sum())
@@ -172,7 +172,7 @@ class NormalEquations:
     def _eliminate(self, columns: slice, damping: float) -> PointElimination | TrackElimination:
         m = self.objective.measurements
         hessian = self.point_hessian[:, columns].clone()
-        hessian[[0, 3, 5]] *= 1 + damping
+        hessian[DIAGONAL] *= 1 + damping
         by_frame = hessian.unflatten(1, (-1, m.points_per_frame))
         if self.next_frame is not None and self.second_frame is not None:
             return TrackElimination(by_frame, m.pairs, self.pair_coupling, self.next_frame, self.second_frame)
@@ -221,7 +221,7 @@ def linearise(
             hessian_moments.addmm_(hessian[free].flatten(0, 1), products.mT)
     terms = {name: float(cost) for name, cost in costs.items()}
     if len(m.inactive_columns):
-        point_hessian[:, m.inactive_columns] = point_hessian.new_tensor([1.0, 0, 0, 1, 0, 1])[:, None]
+        point_hessian[:, m.inactive_columns] = point_hessian.new_tensor(IDENTITY)[:, None]
     pair_coupling = _add_pairs(objective, state, terms, m.by_frame(point_hessian), m.by_frame(point_gradient))
     bands = _add_tracks(objective, state, terms, m.by_frame(point_hessian), m.by_frame(point_gradient))
     gradient_map, hessian_map = _moment_maps(points.dtype, points.device)
@@ -269,7 +269,7 @@ def _add_tracks(
         information = track.scale.square()
         for offset, factor in enumerate((1.0, -2.0, 1.0)):
             gradient[:, offset : offset + frames] += factor * track.scale * track.residual
-            hessian[[0, 3, 5], offset : offset + frames] += factor**2 * information
+            hessian[DIAGONAL, offset : offset + frames] += factor**2 * information
         next_frame[:-1] -= 2 * information
         next_frame[1:] -= 2 * information
         second_frame += information
