@@ -68,6 +68,8 @@ def gauss_newton(
             moving = [descent.moving for descent in descents]
             steps_m = _largest_movements(step)
             trial = best.retracted(step.cameras, step.points)
+            del step
+        del system
         if all(descent.stop for descent in descents):
             stops = tuple(descent.stop or Stop.ITERATIONS for descent in descents)
             return Outcome(best, stops, tuple(map(tuple, records)))
