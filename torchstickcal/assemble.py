@@ -35,14 +35,14 @@ def assemble(
         session: which of the sessions solved together it is.
     """
     one = slice(session, session + 1)
-    used, sigma_px = reached.measurements[one], reached.sigma_px[session]
+    measurements, inliers, sigma_px = measurements[one], reached.inliers[session], reached.sigma_px[session]
     rotations, translations = reached.state.rotations[session], reached.state.translations[session]
-    points = used.by_frame(reached.state.points[session].where(used.active[0], torch.nan)).movedim(0, -1)
+    points = measurements.by_frame(reached.state.points[session].where(inliers.any(0), torch.nan)).movedim(0, -1)
     residuals = torch.empty_like(observations.keypoints, dtype=torch.float64)
-    for frames in used.frame_slices():
+    for frames in measurements.frame_slices():
         seen = (observations.visible[:, frames] & points[frames].isfinite().all(-1))[..., None]
         keypoints = observations.keypoints[:, frames].double()
-        found = reprojection_residuals(points[frames], rotations, translations, keypoints, used.cameras[0])
+        found = reprojection_residuals(points[frames], rotations, translations, keypoints, measurements.cameras[0])
         residuals[:, frames] = found.where(seen, torch.nan)
     starts, ends = [stick.start for stick in observations.sticks], [stick.end for stick in observations.sticks]
     distortion, size, cameras = observations.distortion, observations.image_size, observations.num_cameras
@@ -55,7 +55,7 @@ def assemble(
         translations=as_given(translations),
         points=as_given(points),
         residuals_px=as_given(residuals),
-        inliers=used.by_frame(used.visible)[0],
+        inliers=measurements.by_frame(inliers),
         stick_lengths_m=as_given((points[:, ends] - points[:, starts]).norm(dim=-1)),
         sigma_px=as_given(sigma_px),
         intrinsics=as_given(observations.cameras.matrix),
@@ -68,13 +68,13 @@ def assemble(
         camera_names=tuple(observations.camera_label(index) for index in range(cameras)),
         stages=tuple(stages),
         seconds=dict(seconds),
-        warnings=_warnings(observations, measurements[one], used, sigma_px),
+        warnings=_warnings(observations, measurements, inliers, sigma_px),
     )
 
 
-def _warnings(observations: Observations, measurements: Measurements, used: Measurements, sigma_px: Tensor) -> tuple[str, ...]:
+def _warnings(observations: Observations, measurements: Measurements, inliers: Tensor, sigma_px: Tensor) -> tuple[str, ...]:
     found: list[str] = []
-    comparable, kept = int(measurements.visible.sum()), int(used.visible.sum())
+    comparable, kept = int(measurements.visible.sum()), int(inliers.sum())
     seen = int(observations.visible[:, :, measurements.by_frame(measurements.active[0]).any(0)].sum())
     if seen > comparable:
         found.append(f"{seen - comparable} of {seen} keypoints took no part: no second camera saw the point.")

@@ -107,10 +107,11 @@ def scale_factors(measurements: Measurements, points: Tensor, known: Sequence[Ru
 
 
 class StageResult(NamedTuple):
-    """Where a stage ended: the state, the measurements that took part, their noise before it, and its records."""
+    """Where a stage ended: the state, which keypoints took part, their noise before it, and its records."""
 
     state: State
-    measurements: Measurements
+    inliers: Tensor
+    """(B, C, N)"""
     sigma_px: Tensor
     """(B, P)"""
     records: tuple[StageRecord, ...]
@@ -150,7 +151,7 @@ def run_stage(
     seconds = time.perf_counter() - began
     ended = zip(outcome.stops, outcome.iterations, strict=True)
     records = tuple(StageRecord(name, stop, seconds, iterations) for stop, iterations in ended)
-    return StageResult(state, measurements, sigma_px, records)
+    return StageResult(state, measurements.visible, sigma_px, records)
 
 
 def _losses(stage: Stage, measurements: Measurements, state: State, sigma_px: Tensor) -> dict[str, Loss]:
