@@ -3,7 +3,7 @@
 from torchstickcal.simulate.clocks import Clocks
 from torchstickcal.simulate.cube import Cube, CubeViews
 from torchstickcal.simulate.motions import ACTIONS, Motion, action
-from torchstickcal.simulate.presets import PRESETS, golf_session, preset
+from torchstickcal.simulate.presets import PRESETS, golf_session, preset, session_specs
 from torchstickcal.simulate.regimes import Noise
 from torchstickcal.simulate.rigs import Lens
 from torchstickcal.simulate.session import Assumptions, SessionSpec, SimulatedSession, read_simulated, write_simulated
@@ -24,5 +24,6 @@ __all__ = [
     "golf_session",
     "preset",
     "read_simulated",
+    "session_specs",
     "write_simulated",
 ]

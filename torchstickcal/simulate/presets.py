@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 from torchstickcal.errors import CalibrationError
 from torchstickcal.io.session import Truth
 from torchstickcal.observations import Observations
@@ -37,6 +39,41 @@ def preset(name: str) -> tuple[SessionSpec, ...]:
     if name not in PRESETS:
         raise CalibrationError("unknown preset", where="preset", got=repr(name), expected=f"one of {', '.join(PRESETS)}")
     return PRESETS[name]()
+
+
+def session_specs(name: str, count: int | None = None, seed: int = 0) -> tuple[SessionSpec, ...]:
+    """The first ``count`` sessions of a preset, by default all, or ``count`` of a sport, by default one.
+
+    Args:
+        name: a preset or a sport.
+        count: how many.
+        seed: added to every session's own.
+
+    Raises:
+        CalibrationError: for an unknown name, or a count below 1.
+    """
+    if name not in PRESETS and name not in ACTIONS:
+        known = f"a preset ({', '.join(PRESETS)}) or a sport ({', '.join(ACTIONS)})"
+        raise CalibrationError("nothing of that name to simulate", where="name", got=repr(name), expected=known)
+    if count is not None and count < 1:
+        raise CalibrationError("no sessions to simulate", where="count", got=count, expected="1 or more")
+    if name in PRESETS:
+        return tuple(replace(spec, seed=spec.seed + seed) for spec in preset(name)[:count])
+    return tuple(everyday(name, seed + number) for number in range(count or 1))
+
+
+def everyday(sport: str, seed: int = 0) -> SessionSpec:
+    """A sport as six cameras and a decent detector see it for some seconds."""
+    return SessionSpec(
+        name=f"{sport}_{seed}",
+        sport=sport,
+        seed=seed,
+        layout="ring",
+        lens=_VIDEO,
+        radius_m=4.5,
+        path="circle",
+        regimes=(DetectorNoise(), SelfOcclusion(), Outliers(0.02), Gaps(0.05)),
+    )
 
 
 def sports_stick_syn(layout: str = "hemisphere") -> tuple[SessionSpec, ...]:

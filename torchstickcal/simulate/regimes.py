@@ -121,9 +121,8 @@ class Gaps:
         """The views after it."""
         begin = self.share / ((1 - self.share) * self.mean_frames)
         draws = rng.random(views.inliers.shape)
-        gone = np.empty(views.inliers.shape, dtype=bool)
-        gone[:, 0] = draws[:, 0] < self.share
-        for frame in range(1, gone.shape[1]):
+        gone = draws < self.share
+        for frame in range(1, draws.shape[1]):
             gone[:, frame] = draws[:, frame] < np.where(gone[:, frame - 1], 1 - 1 / self.mean_frames, begin)
         return views.hiding(gone)
 

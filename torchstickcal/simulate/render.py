@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
-from itertools import pairwise
+from itertools import islice, pairwise
 from pathlib import Path
 
 import cv2
@@ -21,10 +21,25 @@ Picture = NDArray[np.uint8]
 """(H, W, 3), RGB"""
 
 _PAPER, _FLOOR, _CAMERA = (250, 250, 247), (214, 216, 212), (150, 150, 158)
-_COLOURS = {"left": (33, 118, 174), "right": (210, 73, 52), "": (52, 56, 64)}
+_LEFT, _RIGHT, _MIDDLE = (33, 118, 174), (210, 73, 52), (52, 56, 64)
 _STICK, _TRACE = (20, 20, 20), (232, 152, 20)
 _FLOOR_M, _FRUSTUM_M = 2.5, 0.28
 _SUBPIXEL_BITS = 4
+_FILM_FPS = 25
+_GIF_COLOURS = 128
+
+Bone = tuple[int, int, tuple[int, int, int]]
+
+
+def _bone(joint: str, parent: str) -> Bone:
+    """Its ends and colour; shoulders are drawn from the neck."""
+    if joint.endswith("shoulder"):
+        return JOINT_INDEX["neck"], JOINT_INDEX[joint], _MIDDLE
+    colour = {"left": _LEFT, "right": _RIGHT}.get(joint.partition("_")[0], _MIDDLE)
+    return JOINT_INDEX[parent], JOINT_INDEX[joint], colour
+
+
+_BONES = [_bone(joint, parent) for joint, parent in PARENTS.items()]
 
 
 class View:
@@ -37,12 +52,12 @@ class View:
     """
 
     def __init__(
-        self, azimuth: float = 60.0, elevation: float = 14.0, distance_m: float = 8.0, size: tuple[int, int] = (640, 560)
+        self, azimuth: float = 60.0, elevation: float = 14.0, distance_m: float = 14.0, size: tuple[int, int] = (640, 560)
     ) -> None:
         a, e = np.deg2rad(azimuth), np.deg2rad(elevation)
         centre = np.array(SCENE_CENTRE) + distance_m * np.array([np.cos(e) * np.cos(a), np.cos(e) * np.sin(a), np.sin(e)])
         self._rotation, self._centre = look_at(centre[None], np.array(SCENE_CENTRE))[0], centre
-        self._focal, self._size = 0.44 * min(size) * distance_m / 2.2, size
+        self._focal, self._size = 0.44 * min(size) * distance_m / 2.5, size
 
     def draw(self, points: Array, trace: Array, centres: Array, rotations: Array) -> Picture:
         """Picture of one instant.
@@ -65,13 +80,13 @@ class View:
         for age, piece in enumerate(pairwise(trace), 1):
             share = age / max(1, len(trace) - 1)
             self._line(picture, np.stack(piece), _mixed(_TRACE, _PAPER, 0.15 + 0.85 * share), 2)
-        bones = [(JOINT_INDEX[parent], JOINT_INDEX[joint], joint.partition("_")[0]) for joint, parent in PARENTS.items()]
-        for start, end, side in sorted(bones, key=lambda bone: -self._depth(points[list(bone[:2])]).mean()):
-            self._line(picture, points[[start, end]], _COLOURS.get(side, _COLOURS[""]), 4)
+        for start, end, colour in sorted(_BONES, key=lambda bone: -self._depth(points[list(bone[:2])]).mean()):
+            self._line(picture, points[[start, end]], colour, 4)
         self._line(picture, points[len(JOINTS) :], _STICK, 3)
         head = points[[JOINT_INDEX["head"], JOINT_INDEX["head_top"]]].mean(0)
         radius = self._focal * 0.11 / float(self._depth(head))
-        cv2.circle(picture, self._pixels(head), round(radius * 2**_SUBPIXEL_BITS), _COLOURS[""], 2, cv2.LINE_AA, _SUBPIXEL_BITS)
+        x, y = self._pixels(head).tolist()
+        cv2.circle(picture, (x, y), round(radius * 2**_SUBPIXEL_BITS), _MIDDLE, 2, cv2.LINE_AA, _SUBPIXEL_BITS)
         return picture
 
     def _depth(self, points: Array) -> Array:
@@ -104,17 +119,15 @@ def camera_frames(session: SimulatedSession, camera: int, width: int = 640) -> I
     size = session.observations.image_size.expand(session.observations.num_cameras, 2)[camera].tolist()
     scale = width / size[0]
     stick = session.observations.sticks[0]
-    bones = [(JOINT_INDEX[parent], JOINT_INDEX[joint], joint.partition("_")[0]) for joint, parent in PARENTS.items()]
     for keypoints, inliers in zip(session.observations.keypoints[camera].numpy(), session.inliers[camera], strict=True):
         picture = np.full((round(size[1] * scale), width, 3), _PAPER, np.uint8)
         seen = np.isfinite(keypoints).all(-1)
         pixels = np.round(np.nan_to_num(keypoints) * scale * 2**_SUBPIXEL_BITS).astype(np.int32)
-        for start, end, side in [*bones, (stick.start, stick.end, "stick")]:
+        for start, end, colour in [*_BONES, (stick.start, stick.end, _STICK)]:
             if seen[start] and seen[end]:
-                colour = _STICK if side == "stick" else _COLOURS.get(side, _COLOURS[""])
                 cv2.line(picture, pixels[start], pixels[end], colour, 2, cv2.LINE_AA, _SUBPIXEL_BITS)
         for point in np.flatnonzero(seen):
-            radius, colour = (4, _COLOURS[""]) if inliers[point] else (9, _COLOURS["right"])
+            radius, colour = (4, _MIDDLE) if inliers[point] else (9, _RIGHT)
             cv2.circle(picture, pixels[point], radius << _SUBPIXEL_BITS, colour, 1, cv2.LINE_AA, _SUBPIXEL_BITS)
         yield picture
 
@@ -126,9 +139,17 @@ def contact_sheet(pictures: Iterable[Picture], columns: int) -> Picture:
     return np.concatenate([np.concatenate(rows[k : k + columns], axis=1) for k in range(0, len(rows), columns)])
 
 
+def write_film(path: str | Path, session: SimulatedSession, view: View | None = None) -> None:
+    """Write the session seen from outside as an animation in real time, of at most 25 pictures a second."""
+    every = max(1, round(session.fps / _FILM_FPS))
+    write_gif(path, islice(scene_frames(session, view), 0, None, every), session.fps / every)
+
+
 def write_gif(path: str | Path, pictures: Iterable[Picture], fps: float) -> None:
     """Write an animation that repeats. GIF counts hundredths of a second: at most 50 frames per second."""
-    first, *rest = (Image.fromarray(picture).quantize(64, dither=Image.Dither.NONE) for picture in pictures)
+    shown = list(pictures)
+    palette = Image.fromarray(np.concatenate(shown[:: max(1, len(shown) // 6)])).quantize(_GIF_COLOURS)
+    first, *rest = (Image.fromarray(picture).quantize(palette=palette, dither=Image.Dither.NONE) for picture in shown)
     with atomic_path(path) as temporary:
         duration = max(20, round(1000 / fps))
         first.save(temporary, format="GIF", save_all=True, append_images=rest, duration=duration, loop=0, optimize=False)

@@ -70,7 +70,7 @@ class CameraRig:
 
     def contains(self, pixels: Array) -> NDArray[np.bool_]:
         """Whether pixels (..., 2) are in the image; NaN is not."""
-        return (pixels >= 0).all(-1) & (pixels <= np.array(self.image_size) - 1.0).all(-1)
+        return np.all((pixels >= 0) & (pixels <= np.array(self.image_size) - 1.0), axis=-1)
 
     def rows(self, points: Array, cameras: NDArray[np.intp]) -> Array:
         """Image rows (N,) of points (N, 3), each in a camera of its own (N,), also beyond the image."""
@@ -87,9 +87,9 @@ def camera_rig(layout: str, count: int, rng: np.random.Generator, lens: Lens | N
     """Cameras that look at the scene's centre.
 
     Args:
-        layout: ``hemisphere``: spread evenly over it from above to the side, in order; ``random``: anywhere on it; ``ring``:
-            around the scene, about evenly, at alternating heights; ``line``: side by side; ``arena``: in and between the upper corners of
-            a hall of 12 x 9 m.
+        layout: ``hemisphere``: spread evenly over it from above to the side, in order; ``random``: anywhere on it;
+            ``ring``: around the scene, about evenly, at alternating heights; ``line``: side by side; ``arena``: in and
+            between the upper corners of a hall of 12 x 9 m.
         count: 2 to 16 cameras.
         rng: for random places and varied lenses.
         lens: what they carry.

@@ -14,7 +14,7 @@ from torchstickcal.simulate.skeleton import JOINT_INDEX, SIDES, STANDING_HEIGHT_
 Array = NDArray[np.float64]
 Plane = tuple[tuple[float, float, float], tuple[float, float, float]]
 
-_ANGLE_VARIATION_DEG, _LENGTH_VARIATION_M, _TIME_VARIATION = 2.0, 0.01, 0.03
+_ANGLE_VARIATION_DEG, _LENGTH_VARIATION_M, _TIME_VARIATION = 1.5, 0.01, 0.03
 _FULL_REACH = 0.985
 _HAND_TO_STICK = 0.4
 _FREE_HAND = (0.05, 0.09, -0.30)
