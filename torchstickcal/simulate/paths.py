@@ -13,7 +13,7 @@ Array = NDArray[np.float64]
 
 _CORNERS = {"circle": 0, "square": 4, "triangle": 3}
 PATHS = ("stay", *_CORNERS, "figure8")
-_STEP_M = 0.4
+_STEP_M = 0.3
 _SWING_SHARE = 0.65
 _LIFT_M = 0.10
 
@@ -85,7 +85,7 @@ class Walk:
         Of two feet one leads and the other follows by half a step.
         """
         begin = self.period_s * np.floor_divide(times, self.period_s)
-        half = (self.end_s - self.start_s) / (2 * self._steps)
+        half = (self.end_s - self.start_s) / (2 * self._steps - 1 + 2 * _SWING_SHARE)
 
         def planted(after_s: float) -> Array:
             place, turned = self.body(begin + after_s)

@@ -23,10 +23,10 @@ Picture = NDArray[np.uint8]
 _PAPER, _FLOOR, _CAMERA = (250, 250, 247), (214, 216, 212), (150, 150, 158)
 _LEFT, _RIGHT, _MIDDLE = (33, 118, 174), (210, 73, 52), (52, 56, 64)
 _STICK, _TRACE = (20, 20, 20), (232, 152, 20)
+_INKS = (_FLOOR, _CAMERA, _LEFT, _RIGHT, _MIDDLE, _STICK, _TRACE)
 _FLOOR_M, _FRUSTUM_M = 2.5, 0.28
 _SUBPIXEL_BITS = 4
 _FILM_FPS = 25
-_GIF_COLOURS = 128
 
 Bone = tuple[int, int, tuple[int, int, int]]
 
@@ -147,9 +147,10 @@ def write_film(path: str | Path, session: SimulatedSession, view: View | None = 
 
 def write_gif(path: str | Path, pictures: Iterable[Picture], fps: float) -> None:
     """Write an animation that repeats. GIF counts hundredths of a second: at most 50 frames per second."""
-    shown = list(pictures)
-    palette = Image.fromarray(np.concatenate(shown[:: max(1, len(shown) // 6)])).quantize(_GIF_COLOURS)
-    first, *rest = (Image.fromarray(picture).quantize(palette=palette, dither=Image.Dither.NONE) for picture in shown)
+    shades = [_mixed(ink, _PAPER, share) for ink in _INKS for share in np.linspace(0, 1, 16)]
+    palette = Image.new("P", (1, 1))
+    palette.putpalette(np.array(shades, dtype=np.uint8).tobytes())
+    first, *rest = (Image.fromarray(picture).quantize(palette=palette, dither=Image.Dither.NONE) for picture in pictures)
     with atomic_path(path) as temporary:
         duration = max(20, round(1000 / fps))
         first.save(temporary, format="GIF", save_all=True, append_images=rest, duration=duration, loop=0, optimize=False)
