@@ -330,6 +330,8 @@ def test_specifications_by_name():
         session_specs("curling")
     with pytest.raises(CalibrationError, match=r"no sessions to simulate \(count\): got 0"):
         session_specs("hard", count=0)
+    with pytest.raises(CalibrationError, match=r"not a seed.*got -1; expected 0 or more"):
+        session_specs("golf", seed=-1)
     with pytest.raises(CalibrationError, match=r"unknown preset.*'easy'.*hard"):
         preset("easy")
     with pytest.raises(CalibrationError, match=r"unknown layout.*'dome'.*hemisphere"):

@@ -50,13 +50,15 @@ def session_specs(name: str, count: int | None = None, seed: int = 0) -> tuple[S
         seed: added to every session's own.
 
     Raises:
-        CalibrationError: for an unknown name, or a count below 1.
+        CalibrationError: for an unknown name, a count below 1, or a seed below 0.
     """
     if name not in PRESETS and name not in ACTIONS:
         known = f"a preset ({', '.join(PRESETS)}) or a sport ({', '.join(ACTIONS)})"
         raise CalibrationError("nothing of that name to simulate", where="name", got=repr(name), expected=known)
     if count is not None and count < 1:
         raise CalibrationError("no sessions to simulate", where="count", got=count, expected="1 or more")
+    if seed < 0:
+        raise CalibrationError("not a seed", where="seed", got=seed, expected="0 or more")
     if name in PRESETS:
         return tuple(replace(spec, seed=spec.seed + seed) for spec in preset(name)[:count])
     return tuple(everyday(name, seed + number) for number in range(count or 1))

@@ -116,39 +116,47 @@ class Motion:
         return self.action.period_s / self.tempo
 
     def _points(self, times: Array) -> Array:
-        action, body, scale = self.action, self.skeleton, self.skeleton.height_m / STANDING_HEIGHT_M
+        action, scale = self.action, self.skeleton.height_m / STANDING_HEIGHT_M
         posture = _posture(action, times, self.variation, self.seed)
         pose = dict(zip(_CHANNELS, posture.T, strict=False))
         walk = Walk(self.path, self.laps, *action.walk_s, action.period_s)
         place, turned = walk.body(times)
 
-        feet = scale * posture[:, _FEET].reshape(-1, 2, 3) + [0, 0, body.ankle_height_m]
+        feet = scale * posture[:, _FEET].reshape(-1, 2, 3) + [0, 0, self.skeleton.ankle_height_m]
         ankles = {side: walk.foot(times, feet[:, k], leads=side == "right") for k, side in enumerate(SIDES)}
         pelvis = place + _apply(turned, scale * np.stack([pose["sway_m"], pose["forward_m"], pose["height_m"]], axis=-1))
-        for ankle in ankles.values():
-            pelvis[:, 2] = ankle[:, 2] + _reachable(
-                pelvis[:, 2] - ankle[:, 2],
-                pelvis - ankle,
-                np.array([0.0, 0.0, 1.0]),
-                _FULL_REACH * (body.thigh_m + body.shank_m),
-            )
+        self._lower(pelvis, ankles)
 
-        joints = body.forward(pelvis, _trunk_rotations(pose, turned))
-        pelvis_turned = turned @ rotation(2, pose["pelvis_turn"])
-        knees_to = turned[..., 1] + pelvis_turned[..., 1]
-        for side, ankle in ankles.items():
-            knee = bend(pelvis, ankle, body.thigh_m, body.shank_m, knees_to)
-            joints[:, JOINT_INDEX[f"{side}_knee"]] = knee
-            joints[:, JOINT_INDEX[f"{side}_shin"]] = knee + body.bone_m("right_shin") / body.shank_m * (ankle - knee)
-            joints[:, JOINT_INDEX[f"{side}_ankle"]] = ankle
-
-        chest = turned @ _leaning_turn(pose, "chest")
+        joints = self.skeleton.forward(pelvis, _trunk_rotations(pose, turned))
+        self._place_legs(joints, ankles, turned[..., 1] + (turned @ rotation(2, pose["pelvis_turn"]))[..., 1])
         start, stick = self._stick(pose, turned, joints, scale)
+        self._place_arms(joints, start, stick, turned @ _leaning_turn(pose, "chest"))
+        ends = np.stack([start, start + action.stick_m * stick], axis=1)
+        return np.concatenate([joints, ends], axis=1)
+
+    def _lower(self, pelvis: Array, ankles: Mapping[str, Array]) -> None:
+        """Lower a pelvis (T, 3) to where both legs reach their ankles."""
+        up, leg_m = np.array([0.0, 0.0, 1.0]), _FULL_REACH * (self.skeleton.thigh_m + self.skeleton.shank_m)
+        for ankle in ankles.values():
+            pelvis[:, 2] = ankle[:, 2] + _reachable(pelvis[:, 2] - ankle[:, 2], pelvis - ankle, up, leg_m)
+
+    def _place_legs(self, joints: Array, ankles: Mapping[str, Array], knees_to: Array) -> None:
+        """Put the legs' joints between pelvis and ankles, the knees bent towards vectors (T, 3)."""
+        body = self.skeleton
+        for side, ankle in ankles.items():
+            knee = bend(joints[:, JOINT_INDEX["pelvis"]], ankle, body.thigh_m, body.shank_m, knees_to)
+            shin = knee + body.bone_m("right_shin") / body.shank_m * (ankle - knee)
+            for joint, point in (("knee", knee), ("shin", shin), ("ankle", ankle)):
+                joints[:, JOINT_INDEX[f"{side}_{joint}"]] = point
+
+    def _place_arms(self, joints: Array, start: Array, stick: Array, chest: Array) -> None:
+        """Put the arms' joints between shoulders and grips, or beside the body."""
+        body = self.skeleton
         for side in SIDES:
             shoulder = joints[:, JOINT_INDEX[f"{side}_shoulder"]]
             outward = 1.0 if side == "right" else -1.0
-            if side in action.grips_m:
-                hand = start + action.grips_m[side] * stick
+            if side in self.action.grips_m:
+                hand = start + self.action.grips_m[side] * stick
                 palm = unit(unit(hand - shoulder) + _HAND_TO_STICK * stick)
             else:
                 hand = shoulder + chest @ (body.height_m * np.array(_FREE_HAND) * [outward, 1, 1])
@@ -157,8 +165,6 @@ class Motion:
             elbow = bend(shoulder, wrist, body.upper_arm_m, body.forearm_m, _elbow_side(shoulder, wrist, chest, outward))
             for joint, point in (("elbow", elbow), ("wrist", wrist), ("hand", hand)):
                 joints[:, JOINT_INDEX[f"{side}_{joint}"]] = point
-        ends = np.stack([start, start + action.stick_m * stick], axis=1)
-        return np.concatenate([joints, ends], axis=1)
 
     def _stick(self, pose: dict[str, Array], turned: Array, joints: Array, scale: float) -> tuple[Array, Array]:
         """The stick's start and direction, (T, 3) each, where every hand that holds it can reach it."""
@@ -170,9 +176,9 @@ class Motion:
         shoulders = {side: joints[:, JOINT_INDEX[f"{side}_shoulder"]] for side in SIDES}
         hub = (shoulders["left"] + shoulders["right"]) / 2
         middle_m = float(np.mean(list(action.grips_m.values())))
-        bent = np.sqrt(1 - _HAND_TO_STICK**2)
-        arm_m = _FULL_REACH * (body.upper_arm_m + body.forearm_m)
-        arm_m = body.hand_m * bent + np.sqrt(arm_m**2 - (body.hand_m * _HAND_TO_STICK) ** 2)
+        to_wrist_m = _FULL_REACH * (body.upper_arm_m + body.forearm_m)
+        aside_m = body.hand_m * _HAND_TO_STICK
+        arm_m = np.sqrt(body.hand_m**2 - aside_m**2) + np.sqrt(to_wrist_m**2 - aside_m**2)
         reach = scale * pose["arms_reach_m"]
         for side, grip_m in action.grips_m.items():
             from_shoulder = hub + reach[:, None] * towards + (grip_m - middle_m) * stick - shoulders[side]
