@@ -157,5 +157,9 @@ class TrackLoss(Loss, ABC):
     """Couples three consecutive frames of one point through their second difference."""
 
     @abstractmethod
+    def slope(self, points: Tensor, moved: Tensor, active: Tensor) -> Tensor:
+        """Half the derivative of the loss where the points move by (..., 3, F, P), summed; differentiable."""
+
+    @abstractmethod
     def linearise(self, points: Tensor, active: Tensor) -> TrackTerms:
         """Terms at points (..., 3, F, P) with a mask (..., F, P) of points that exist."""

@@ -68,9 +68,7 @@ class Objective:
         return values
 
     def slope(self, state: State, camera_step: Tensor, point_step: Tensor) -> Tensor:
-        """Half the derivative of the objective along a step from a state, differentiable by measurements and poses.
-
-        Of track losses, which depend on neither, there is nothing in it.
+        """Half the derivative of the objective along a step from a state, differentiable by measurements and state.
 
         Args:
             state: where.
@@ -86,6 +84,8 @@ class Objective:
         for loss in self._pair.values():
             difference, moved_ends = self._differences(state.points), self._differences(point_step)
             total = total + loss.slope(difference, moved_ends, m.lengths_m[:, None], m.pair_active)
+        for loss in self._track.values():
+            total = total + loss.slope(m.by_frame(state.points), m.by_frame(point_step), m.by_frame(m.active))
         return total
 
     def linearise_chunk(self, state: State, columns: Columns, exact: bool = False) -> dict[str, CameraPointTerms]:
