@@ -29,6 +29,7 @@ from torchstickcal.losses import Loss, ReprojectionLoss, SmoothnessLoss, StickLe
 from torchstickcal.objective import Objective
 from torchstickcal.problem import Measurements, State
 from torchstickcal.solvers import Termination, gauss_newton
+from torchstickcal.workers import on_worker
 
 COST_TOLERANCE = 1e-6
 FOCAL_PX, WIDTH, HEIGHT = 1400.0, 1920, 1080
@@ -91,7 +92,9 @@ def ours(problem: Problem, losses: dict[str, Loss]) -> Timing:
     start = State(problem.rotations[None], problem.translations[None], problem.points[None])
     objective = Objective(measurements, losses)
     began = time.perf_counter()
-    outcome = gauss_newton(
+    outcome = on_worker(
+        start.points.device,
+        gauss_newton,
         objective,
         start,
         cameras_free=True,

@@ -9,7 +9,7 @@ import pytest
 
 ROOT = Path(__file__).parents[1]
 LAYERS = [
-    ["errors", "files", "symmetric"],
+    ["errors", "files", "symmetric", "workers"],
     ["se3"],
     ["cameras", "observations"],
     ["losses"],

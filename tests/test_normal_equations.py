@@ -182,7 +182,7 @@ def test_parts_add_up(
     measurements, state = disturbed
     objective = Objective(measurements, losses)
     whole = NormalEquations(objective, state, True, 1e-3).step()
-    monkeypatch.setattr("torchstickcal.problem._CHUNK_KEYPOINTS", dict.fromkeys(("one thread", "threads"), 200))
+    monkeypatch.setattr("torchstickcal.problem._CHUNK_KEYPOINTS", {"cpu": 200})
     monkeypatch.setattr("torchstickcal.solvers.parts._TRACK_POINTS", 90)
     if not kept:
         monkeypatch.setattr("torchstickcal.solvers.normal_equations._KEPT_BYTES", 0)

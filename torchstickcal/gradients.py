@@ -19,6 +19,7 @@ from torchstickcal.errors import ConfigError
 from torchstickcal.objective import Objective
 from torchstickcal.problem import State
 from torchstickcal.solvers.normal_equations import NormalEquations
+from torchstickcal.workers import on_worker
 
 _DAMPINGS = (0.0, 1e-10, 1e-7)
 """Tried in turn: a minimum that leaves a scale open is singular along it, which a gradient across it does not feel."""
@@ -124,6 +125,10 @@ class _Attached(torch.autograd.Function):
     @staticmethod
     @torch.autograd.function.once_differentiable
     def backward(ctx: Any, *gradients: Tensor) -> tuple[Any, ...]:  # pyright: ignore[reportIncompatibleMethodOverride]
+        return on_worker(gradients[0].device, _Attached._pulled_back, ctx, *gradients)
+
+    @staticmethod
+    def _pulled_back(ctx: Any, *gradients: Tensor) -> tuple[Any, ...]:
         by_rotations, by_translations, by_points = gradients
         given: list[Tensor | None] = [None if v is None else v.detach() for v in ctx.saved_tensors]
         minimum, needed = ctx.minimum, ctx.needs_input_grad[4:]

@@ -22,6 +22,7 @@ from torchstickcal.problem import Measurements, State
 from torchstickcal.solvers import IterationRecord
 from torchstickcal.solvers.newton import polish
 from torchstickcal.stages import Ruler, StageResult, rulers, run_stage, scale_factors
+from torchstickcal.workers import map_on_workers
 
 _KEYPOINTS_AT_ONCE = 32_000
 """Keypoints of the sessions that a CPU solves side by side: more would leave its cache."""
@@ -106,17 +107,28 @@ class CalibrationLayer(nn.Module):
         """All sessions; those that can be begun are solved side by side."""
         shape = given.keypoints.shape[:-1]
         found = [_failed(shape[1:], given.keypoints) for _ in range(shape[0])]
+        device = given.keypoints.device
+
+        def begin(index: int) -> _Begun | str:
+            try:
+                return self._begin(given.observations(index, self.sticks), initial, index)
+            except CalibrationError as error:
+                return f"{type(error).__name__}: {error}"
+
         begun: dict[int, _Begun] = {}
         with torch.no_grad():
-            for index in range(shape[0]):
-                try:
-                    begun[index] = self._begin(given.observations(index, self.sticks), initial, index)
-                except CalibrationError as error:
-                    found[index] = found[index]._replace(status=f"{type(error).__name__}: {error}")
-        together = len(begun) if given.keypoints.is_cuda else max(1, _KEYPOINTS_AT_ONCE // shape[1:].numel())
-        for first in range(0, len(begun), together):
-            group = list(begun)[first : first + together]
-            solved = self._solve(given.of_sessions(group), [begun[index] for index in group], warm=initial is not None)
+            for index, start in enumerate(map_on_workers(device, begin, range(shape[0]))):
+                if isinstance(start, str):
+                    found[index] = found[index]._replace(status=start)
+                else:
+                    begun[index] = start
+        together = len(begun) if device.type != "cpu" else max(1, _KEYPOINTS_AT_ONCE // shape[1:].numel())
+        groups = [list(begun)[first : first + together] for first in range(0, len(begun), max(1, together))]
+
+        def solve(group: list[int]) -> list[_Solved]:
+            return self._solve(given.of_sessions(group), [begun[index] for index in group], warm=initial is not None)
+
+        for group, solved in zip(groups, map_on_workers(device, solve, groups), strict=True):
             for index, session in zip(group, solved, strict=True):
                 found[index] = session
         tensors = (torch.stack(values) for values in list(zip(*found, strict=True))[:-1])

@@ -17,6 +17,7 @@ from torchstickcal.problem import Measurements
 from torchstickcal.result import Calibration
 from torchstickcal.solvers import IterationRecord
 from torchstickcal.stages import StageRecord, StageResult, rulers, run_stage
+from torchstickcal.workers import on_worker
 
 
 class Callback(Protocol):
@@ -51,8 +52,22 @@ def calibrate(
         ConfigError: for an unusable configuration.
         RigError: if the cameras cannot be placed in one rig.
     """
-    began = time.perf_counter()
     settings = load_config(config)
+    return on_worker(observations.keypoints.device, _calibrated, observations, settings, callback)
+
+
+def points_used(observations: Observations, config: Config) -> list[int] | None:
+    """The points that take part; None for all."""
+    ends = {end for stick in observations.sticks for end in (stick.start, stick.end)}
+    if config.points == "sticks":
+        return sorted(ends)
+    if config.points == "joints":
+        return [point for point in range(observations.num_points) if point not in ends]
+    return None
+
+
+def _calibrated(observations: Observations, settings: Config, callback: Callback | None) -> Calibration:
+    began = time.perf_counter()
     known = rulers([observations], settings)
     precision = torch.float32 if settings.precision == "float32" else torch.float64
     measurements = Measurements.of(observations, points_used(observations, settings), precision)
@@ -76,16 +91,6 @@ def calibrate(
     if callback:
         callback.on_end(calibration)
     return calibration
-
-
-def points_used(observations: Observations, config: Config) -> list[int] | None:
-    """The points that take part; None for all."""
-    ends = {end for stick in observations.sticks for end in (stick.start, stick.end)}
-    if config.points == "sticks":
-        return sorted(ends)
-    if config.points == "joints":
-        return [point for point in range(observations.num_points) if point not in ends]
-    return None
 
 
 def _ignore(record: IterationRecord) -> None:

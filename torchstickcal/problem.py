@@ -18,9 +18,8 @@ from torchstickcal import se3
 from torchstickcal.cameras import Intrinsics
 from torchstickcal.observations import Observations
 
-_CHUNK_KEYPOINTS = {"one thread": 32_000, "threads": 10_900, "accelerator": 1_000_000}
-"""Keypoints worked on at a time. What is worked on stays in the cache of a core; where torch has several threads, three numbers
-of each keypoint are too few for it to start them; on an accelerator an operation should be worth its launch."""
+_CHUNK_KEYPOINTS = {"cpu": 32_000, "cuda": 1_000_000}
+"""Keypoints worked on at a time. What a CPU works on stays in its cache; elsewhere an operation should be worth its launch."""
 
 Columns = slice | Tensor
 """Some of the columns N: a slice of whole frames, or indices."""
@@ -170,9 +169,7 @@ class Measurements:
     @property
     def chunk_keypoints(self) -> int:
         """Keypoints worked on at a time."""
-        if self.pixels.device.type != "cpu":
-            return _CHUNK_KEYPOINTS["accelerator"]
-        return _CHUNK_KEYPOINTS["one thread" if torch.get_num_threads() == 1 else "threads"]
+        return _CHUNK_KEYPOINTS["cpu" if self.pixels.device.type == "cpu" else "cuda"]
 
     def frame_slices(self) -> list[slice]:
         """The frames of each of :meth:`chunks`."""
