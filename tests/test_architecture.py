@@ -21,6 +21,7 @@ LAYERS = [
     ["assemble"],
     ["pipeline", "metrics", "report", "figures"],
     ["io"],
+    ["baselines"],
     ["simulate", "benchmark", "monitor"],
     ["cli"],
 ]
