@@ -65,13 +65,5 @@ def align(source: Tensor, target: Tensor) -> tuple[Tensor, Tensor]:
 
 def rotation_angle(rotations: Tensor) -> Tensor:
     """Angles (...) of rotations (..., 3, 3), radians; exact near zero, where an arc cosine loses half the digits."""
-    skew = torch.stack(
-        [
-            rotations[..., 2, 1] - rotations[..., 1, 2],
-            rotations[..., 0, 2] - rotations[..., 2, 0],
-            rotations[..., 1, 0] - rotations[..., 0, 1],
-        ],
-        dim=-1,
-    )
     trace = rotations.diagonal(dim1=-2, dim2=-1).sum(-1)
-    return torch.atan2(skew.norm(dim=-1), trace - 1)
+    return torch.atan2(2 * se3.vee(rotations).norm(dim=-1), trace - 1)

@@ -55,4 +55,4 @@ def _pose(corners: Array, image: Array) -> tuple[Array, Array]:
     ]
     errors = [np.square(cv2.projectPoints(corners, *pose, camera, None)[0][:, 0] - image).sum() for pose in refined]
     turn, shift = refined[int(np.argmin(errors))]
-    return cv2.Rodrigues(turn)[0], shift[:, 0]
+    return np.asarray(cv2.Rodrigues(turn)[0], np.float64), np.asarray(shift[:, 0], np.float64)
