@@ -6,6 +6,7 @@ from functools import partial
 
 from torchstickcal.baselines.aruco_cube import aruco_cube
 from torchstickcal.baselines.base import BONES, Baseline, Cube, Estimate, Inputs, MissingInputError
+from torchstickcal.baselines.calib_person import calib_person
 from torchstickcal.baselines.ewand import ewand
 from torchstickcal.baselines.human import human_bones, human_height
 from torchstickcal.baselines.simulated_inputs import bone_lengths, cube_views, limb_orientations
@@ -31,6 +32,7 @@ BASELINES: dict[str, Baseline] = {
     "human_bones": human_bones,
     "stick_only": stick_only,
     "aruco_cube": aruco_cube,
+    "calib_person": calib_person,
     "ewand": ewand,
 }
 """The methods by name."""

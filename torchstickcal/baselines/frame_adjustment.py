@@ -22,8 +22,8 @@ from torchstickcal.solvers.normal_equations import linearise
 from torchstickcal.symmetric import expand
 
 _INITIAL_DAMPING = 1e-5
-_MAX_DAMPING = 1e8
-_COST_TOLERANCE = 1e-9
+_MIN_DAMPING, _MAX_DAMPING = 1e-12, 1e8
+_COST_TOLERANCE = 1e-6
 _EXACT_COST_PER_KEYPOINT = 1e-18
 
 FrameResiduals = Callable[[Tensor], Tensor]
@@ -71,7 +71,7 @@ def adjust(
         converged = abs(promised) <= _COST_TOLERANCE * system.cost or reached.cost <= exact
         if decrease > 0:
             converged = converged or decrease <= _COST_TOLERANCE * system.cost
-            state, system, damping = candidate, reached, damping * 0.1
+            state, system, damping = candidate, reached, max(damping * 0.1, _MIN_DAMPING)
         else:
             damping *= 10
     return Adjusted(state, converged, system.reduce(0.0)[0])
