@@ -8,7 +8,9 @@ from torchstickcal.baselines.aruco_cube import aruco_cube
 from torchstickcal.baselines.base import BONES, Baseline, Cube, Estimate, Inputs, MissingInputError
 from torchstickcal.baselines.calib_person import calib_person
 from torchstickcal.baselines.ewand import ewand
+from torchstickcal.baselines.extra_calib import extra_calib
 from torchstickcal.baselines.human import human_bones, human_height
+from torchstickcal.baselines.kineo import kineo
 from torchstickcal.baselines.simulated_inputs import bone_lengths, cube_views, limb_orientations
 from torchstickcal.baselines.stick import stick_only
 
@@ -33,6 +35,8 @@ BASELINES: dict[str, Baseline] = {
     "stick_only": stick_only,
     "aruco_cube": aruco_cube,
     "calib_person": calib_person,
+    "extra_calib": extra_calib,
+    "kineo": kineo,
     "ewand": ewand,
 }
 """The methods by name."""

@@ -11,11 +11,14 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from torchstickcal.errors import CalibrationError
+from torchstickcal.initialise.triangulate import triangulate
 from torchstickcal.observations import Observations
 from torchstickcal.problem import Measurements, State
 from torchstickcal.stages import Ruler, scale_factor
 
 Array = NDArray[np.float64]
+
+_TRIANGULATION_RADIUS_PX = 40.0
 
 BONES = (
     ("neck", "head"), ("head", "head_top"),
@@ -109,3 +112,12 @@ def scaled_by_height(inputs: Inputs, measurements: Measurements, state: State) -
     top, *ankles = (inputs.observations.point_index(name) for name in ("head_top", "left_ankle", "right_ankle"))
     ruler = Ruler((top,), tuple(ankles), required(inputs, "height_m"), rigid=False)
     return state.scaled(scale_factor(measurements, state.points, [ruler]))
+
+
+def triangulated(measurements: Measurements, rotations: Tensor, translations: Tensor) -> State:
+    """The points of all frames at given poses, zero where fewer than two cameras see them."""
+    rays = measurements.cameras.undistort(measurements.pixels.movedim(1, -1)).movedim(-1, 1)
+    weights = measurements.confidence * rays.isfinite().all(1)
+    scale = _TRIANGULATION_RADIUS_PX / float(measurements.cameras.focal_px.mean())
+    points = triangulate(rotations, translations, rays.nan_to_num(), weights, scale=scale)
+    return State(rotations, translations, points.nan_to_num())

@@ -1,4 +1,4 @@
-"""eWand (Gossard et al., "eWand: a calibration framework for wide baseline frame-based and event-based camera systems", ICRA 2024).
+"""eWand, a calibration with a wand (Gossard et al., ICRA 2024).
 
 A wand with markers on a line at known distances is waved through the scene. Of the published method the frame cameras' part
 is here: relative poses of pairs, then bundle adjustment of the markers' trajectories with residuals of reprojection, of the
@@ -53,7 +53,7 @@ def ewand(inputs: Inputs) -> Estimate:
 
 def _middle(observations: Observations) -> list[int]:
     """The third point of the first stick, if there is one."""
-    return [observations.point_names.index(MIDDLE)] if MIDDLE in (observations.point_names or ()) else []
+    return [point for point, name in enumerate(observations.point_names or ()) if name == MIDDLE]
 
 
 def _wand(measurements: Measurements, middle: list[int]) -> FrameResiduals:
