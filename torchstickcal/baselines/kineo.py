@@ -108,7 +108,7 @@ def average_rotations(cameras: int, pairs: list[RelatedPair]) -> Tensor:
 def average_translations(rotations: Tensor, pairs: list[RelatedPair]) -> Tensor:
     """Translations (C, 3), up to scale, whose centres lie along the pairs' directions; zero for the first camera.
 
-    The part of ``c_i - c_j`` across the direction of each pair is to vanish, |c| = 1: an eigenvector, re-weighted to L1.
+    The part of ``c_i - c_j`` across the direction of each pair is to vanish, with all centres together of length 1: an eigenvector.
     """
     cameras = len(rotations)
     weights = torch.tensor([pair.weight for pair in pairs], dtype=torch.float64)
@@ -118,12 +118,8 @@ def average_translations(rotations: Tensor, pairs: list[RelatedPair]) -> Tensor:
     signs = torch.nn.functional.one_hot(ends, cameras).to(weights)
     incidence = (signs[:, 0] - signs[:, 1])[:, 1:]
     rows = torch.einsum("kab,kc->kacb", across, incidence).flatten(2)
-    centres, current = weights.new_zeros(cameras - 1, 3), weights
-    for _ in range(_REWEIGHTINGS):
-        matrix = torch.einsum("kai,kaj,k->ij", rows, rows, current)
-        centres = torch.linalg.eigh(matrix).eigenvectors[:, 0].view(-1, 3)
-        aside = (rows @ centres.flatten()).norm(dim=1)
-        current = weights / aside.clamp_min(_SMALLEST_RESIDUAL)
+    matrix = torch.einsum("kai,kaj,k->ij", rows, rows, weights)
+    centres = torch.linalg.eigh(matrix).eigenvectors[:, 0].view(-1, 3)
     centres = centres * (weights * ((incidence @ centres) * baselines).sum(1)).sum().sign()
     centres = torch.cat([centres.new_zeros(1, 3), centres])
     return -(rotations @ centres[..., None])[..., 0]
