@@ -108,7 +108,7 @@ def average_rotations(cameras: int, pairs: list[RelatedPair]) -> Tensor:
 def average_translations(rotations: Tensor, pairs: list[RelatedPair]) -> Tensor:
     """Translations (C, 3), up to scale, whose centres lie along the pairs' directions; zero for the first camera.
 
-    The part of ``c_i - c_j`` across the direction of each pair is to vanish, with all centres together of length 1: an eigenvector.
+    The part of ``c_i - c_j`` across the direction of each pair is to vanish, all centres together having length 1.
     """
     cameras = len(rotations)
     weights = torch.tensor([pair.weight for pair in pairs], dtype=torch.float64)
