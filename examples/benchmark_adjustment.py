@@ -22,8 +22,9 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from torch import Tensor
 
-from torchstickcal import Extrinsics, Intrinsics
+from torchstickcal import Extrinsics, Intrinsics, se3
 from torchstickcal.losses import Loss, ReprojectionLoss, SmoothnessLoss, StickLengthLoss
 from torchstickcal.objective import Objective
 from torchstickcal.problem import Measurements, State
@@ -38,8 +39,14 @@ Array = NDArray[np.float64]
 class Problem(NamedTuple):
     """Keypoints of a simulated scene and a start near the truth."""
 
-    measurements: Measurements
-    start: State
+    pixels: Tensor
+    """(C, 2, N)"""
+    cameras: Intrinsics
+    frames: int
+    rotations: Tensor
+    translations: Tensor
+    points: Tensor
+    """(3, N); the last two of a frame are the ends of a stick of 1 m"""
 
 
 class Timing(NamedTuple):
@@ -61,52 +68,55 @@ def simulated(cameras: int, frames: int, points: int) -> Problem:
     structure[:, -1] = structure[:, -2] + stick / np.linalg.norm(stick, axis=1, keepdims=True)
     matrix = torch.tensor([[FOCAL_PX, 0, WIDTH / 2], [0, FOCAL_PX, HEIGHT / 2], [0, 0, 1]], dtype=torch.float64)
     lenses = Intrinsics(matrix.expand(cameras, 3, 3))
-    truth = State(*(torch.from_numpy(v) for v in (rotations, translations, structure.reshape(-1, 3).T.copy())))
-    pixels = lenses.project(truth.in_cameras().movedim(1, -1)).movedim(-1, 1)
+    points_m = torch.from_numpy(structure.reshape(-1, 3).T.copy())
+    poses = torch.from_numpy(rotations)[None], torch.from_numpy(translations)[None]
+    pixels = lenses.project(se3.moved(*poses, points_m[None])[0].movedim(1, -1)).movedim(-1, 1)
     pixels = (pixels + torch.from_numpy(rng.normal(0, 1, pixels.shape))).contiguous()
-    measurements = Measurements(
-        pixels,
-        torch.ones(cameras, frames * points, dtype=torch.float64),
-        lenses,
-        frames,
-        torch.tensor([[points - 2, points - 1]]),
-        torch.ones(1, dtype=torch.float64),
-    )
     knock = torch.from_numpy(rng.normal(0, 0.003, (cameras - 1, 6)))
-    return Problem(measurements, truth.retracted(knock, torch.from_numpy(rng.normal(0, 0.01, truth.points.shape))))
+    start = State(*poses, points_m[None]).retracted(knock[None], torch.from_numpy(rng.normal(0, 0.01, points_m.shape))[None])
+    return Problem(pixels, lenses, frames, start.rotations[0], start.translations[0], start.points[0])
 
 
 def ours(problem: Problem, losses: dict[str, Loss]) -> Timing:
     """This project's Gauss-Newton; the cost is that of the reprojection."""
-    objective = Objective(problem.measurements, losses)
+    points_per_frame = problem.pixels.shape[2] // problem.frames
+    measurements = Measurements(
+        problem.pixels[None],
+        torch.ones_like(problem.pixels[None, :, 0]),
+        problem.cameras.batched(),
+        problem.frames,
+        torch.tensor([[points_per_frame - 2, points_per_frame - 1]]),
+        torch.ones(1, 1, dtype=torch.float64),
+    )
+    start = State(problem.rotations[None], problem.translations[None], problem.points[None])
+    objective = Objective(measurements, losses)
     began = time.perf_counter()
     outcome = gauss_newton(
         objective,
-        problem.start,
+        start,
         cameras_free=True,
         termination=Termination(cost_tolerance=COST_TOLERANCE, camera_tolerance=0.0),
         stage="",
         listener=lambda record: None,
     )
-    return Timing(time.perf_counter() - began, outcome.iterations[-1].terms["reprojection"])
+    return Timing(time.perf_counter() - began, outcome.iterations[0][-1].terms["reprojection"])
 
 
 def ceres(problem: Problem) -> Timing:
     """COLMAP's bundle adjuster on Ceres, two threads."""
     import pycolmap
 
-    m, start = problem
     scene = pycolmap.Reconstruction()
-    pixels = m.pixels.movedim(1, -1).numpy()
-    cameras, columns = m.confidence.shape
+    pixels = problem.pixels.movedim(1, -1).numpy()
+    cameras, _, columns = problem.pixels.shape
     for index in range(cameras):
         parameters = [FOCAL_PX, FOCAL_PX, WIDTH / 2, HEIGHT / 2]
         camera = pycolmap.Camera(camera_id=index + 1, model="PINHOLE", width=WIDTH, height=HEIGHT, params=parameters)
         scene.add_camera_with_trivial_rig(camera)
-        pose = pycolmap.Rigid3d(np.hstack([start.rotations[index].numpy(), start.translations[index].numpy()[:, None]]))
+        pose = pycolmap.Rigid3d(np.hstack([problem.rotations[index].numpy(), problem.translations[index].numpy()[:, None]]))
         image = pycolmap.Image(name=str(index), keypoints=pixels[index], camera_id=index + 1, image_id=index + 1)
         scene.add_image_with_trivial_frame(image, pose)
-    for column, point in enumerate(start.points.numpy().T):
+    for column, point in enumerate(problem.points.numpy().T):
         track = pycolmap.Track([pycolmap.TrackElement(index + 1, column) for index in range(cameras)])
         scene.add_point3D(point, track)
     config = pycolmap.BundleAdjustmentConfig()
@@ -123,21 +133,20 @@ def ceres(problem: Problem) -> Timing:
     seconds = time.perf_counter() - began
     poses = [scene.images[index + 1].cam_from_world().matrix() for index in range(cameras)]
     points = np.stack([scene.points3D[index + 1].xyz for index in range(columns)], axis=1)
-    return Timing(seconds, _cost(m, np.stack(poses), points))
+    return Timing(seconds, _cost(problem, np.stack(poses), points))
 
 
 def gtsam_lm(problem: Problem) -> Timing:
     """GTSAM's Levenberg-Marquardt on projection factors."""
     import gtsam
 
-    m, start = problem
     noise, exact = gtsam.noiseModel.Isotropic.Sigma(2, 1.0), gtsam.noiseModel.Constrained.All(6)
     lens = gtsam.Cal3_S2(FOCAL_PX, FOCAL_PX, 0.0, WIDTH / 2, HEIGHT / 2)
     graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
-    cameras, columns = m.confidence.shape
-    pixels = m.pixels.numpy()
+    cameras, _, columns = problem.pixels.shape
+    pixels = problem.pixels.numpy()
     for index in range(cameras):
-        rotation, translation = start.rotations[index].numpy(), start.translations[index].numpy()
+        rotation, translation = problem.rotations[index].numpy(), problem.translations[index].numpy()
         pose = gtsam.Pose3(gtsam.Rot3(rotation.T), -rotation.T @ translation)
         values.insert(gtsam.symbol("x", index), pose)
         if index == 0:
@@ -145,7 +154,7 @@ def gtsam_lm(problem: Problem) -> Timing:
         for column in range(columns):
             keys = gtsam.symbol("x", index), gtsam.symbol("l", column)
             graph.add(gtsam.GenericProjectionFactorCal3_S2(pixels[index, :, column], noise, *keys, lens))
-    for column, point in enumerate(start.points.numpy().T):
+    for column, point in enumerate(problem.points.numpy().T):
         values.insert(gtsam.symbol("l", column), point)
     parameters = gtsam.LevenbergMarquardtParams()
     parameters.setRelativeErrorTol(COST_TOLERANCE)
@@ -161,10 +170,9 @@ def scipy_trf(problem: Problem) -> Timing:
     from scipy.optimize import least_squares
     from scipy.sparse import csr_matrix
 
-    m, start = problem
-    cameras, columns = m.confidence.shape
+    cameras, _, columns = problem.pixels.shape
     free = 6 * (cameras - 1)
-    extrinsics = Extrinsics(start.rotations, start.translations)
+    extrinsics = Extrinsics(problem.rotations, problem.translations)
     residual_rows = np.arange(cameras * columns * 2).reshape(cameras, columns, 2, 1)
     camera_unknowns = 6 * np.arange(cameras - 1)[:, None, None, None] + np.arange(6)
     point_unknowns = free + 3 * np.arange(columns)[:, None, None] + np.arange(3)
@@ -174,29 +182,30 @@ def scipy_trf(problem: Problem) -> Timing:
         np.concatenate([cam.ravel(), pt.ravel()]) for cam, pt in zip(by_camera_at, by_point_at, strict=True)
     )
 
-    def state(x: Array) -> State:
+    def state(x: Array) -> tuple[Tensor, Tensor, Tensor]:
         rotations, translations = extrinsics.compose(torch.from_numpy(x[:free]).view(-1, 6))
-        rotations, translations = torch.cat([start.rotations[:1], rotations]), torch.cat([start.translations[:1], translations])
-        return State(rotations, translations, torch.from_numpy(x[free:]).view(-1, 3).mT)
+        rotations = torch.cat([problem.rotations[:1], rotations])
+        translations = torch.cat([problem.translations[:1], translations])
+        return rotations, translations, torch.from_numpy(x[free:]).view(-1, 3).mT
 
     def residuals(x: Array) -> Array:
-        return (m.cameras.project(state(x).in_cameras().movedim(1, -1)) - m.pixels.movedim(1, -1)).numpy().ravel()
+        return (_projected(problem, *state(x)) - problem.pixels.movedim(1, -1)).numpy().ravel()
 
     def jacobian(x: Array) -> csr_matrix:
-        here = state(x)
-        px, py, pz = here.in_cameras().unbind(1)
+        rotations, translations, points = state(x)
+        px, py, pz = se3.moved(rotations[None], translations[None], points[None])[0].unbind(1)
         rows = torch.zeros(cameras, columns, 2, 3, dtype=torch.float64)
         rows[..., 0, 0], rows[..., 0, 2] = FOCAL_PX / pz, -FOCAL_PX * px / pz**2
         rows[..., 1, 1], rows[..., 1, 2] = FOCAL_PX / pz, -FOCAL_PX * py / pz**2
         tangents = torch.from_numpy(x[:free]).view(-1, 6)
         by_tangent = torch.autograd.functional.jacobian(extrinsics.compose, tangents)
         turned, shifted = (torch.stack([d[c, ..., c, :] for c in range(cameras - 1)]) for d in by_tangent)
-        moved = torch.einsum("cijk,jn->cnik", turned, here.points) + shifted[:, None]
-        data = [(rows[1:] @ moved).numpy().ravel(), (rows @ here.rotations[:, None]).numpy().ravel()]
+        moved = torch.einsum("cijk,jn->cnik", turned, points) + shifted[:, None]
+        data = [(rows[1:] @ moved).numpy().ravel(), (rows @ rotations[:, None]).numpy().ravel()]
         shape = residual_rows.size, free + 3 * columns
         return csr_matrix((np.concatenate(data), (row_index, column_index)), shape=shape)
 
-    x = np.concatenate([np.zeros(free), start.points.mT.reshape(-1).numpy()])
+    x = np.concatenate([np.zeros(free), problem.points.mT.reshape(-1).numpy()])
     began = time.perf_counter()
     with torch.no_grad():
         options: dict[str, Any] = {"x_scale": "jac", "ftol": COST_TOLERANCE, "xtol": None, "gtol": None}
@@ -257,12 +266,15 @@ def _compare(cameras: int, frames: int, points: int, runs: int) -> None:
         print(f"{label} {seconds:9.4f} {seconds / own:6.1f}x  {timings[0].cost / keypoints:.7f}", flush=True)
 
 
-def _cost(measurements: Measurements, poses: Array, points: Array) -> float:
-    rotations, translations = (torch.from_numpy(v.copy()) for v in (poses[:, :, :3], poses[:, :, 3]))
-    projected = measurements.cameras.project(
-        State(rotations, translations, torch.from_numpy(points)).in_cameras().movedim(1, -1)
-    )
-    return float((projected - measurements.pixels.movedim(1, -1)).square().sum())
+def _projected(problem: Problem, rotations: Tensor, translations: Tensor, points: Tensor) -> Tensor:
+    """Pixels (C, N, 2)."""
+    return problem.cameras.project(se3.moved(rotations[None], translations[None], points[None])[0].movedim(1, -1))
+
+
+def _cost(problem: Problem, poses: Array, points: Array) -> float:
+    arrays = (poses[:, :, :3], poses[:, :, 3], points)
+    projected = _projected(problem, *(torch.from_numpy(array.copy()) for array in arrays))
+    return float((projected - problem.pixels.movedim(1, -1)).square().sum())
 
 
 def _looking_at(centre: Array, target: Array) -> Array:

@@ -2,13 +2,15 @@
 
 A solver knows couplings, not losses: a loss that subclasses one of the three classes below works in both solvers.
 ``forward`` is the loss as a scalar of plain tensors, differentiable by autograd; ``linearise`` gives the same residuals
-with their analytic derivatives, laid out coordinate-first for the Gauss-Newton solver.
+with their analytic derivatives, laid out coordinate-first for the Gauss-Newton solver. Both take any leading dimensions
+before those named, for several sessions at once; ``forward`` sums over them, ``linearise`` keeps them.
 """
 
 from __future__ import annotations
 
+import copy
 from abc import ABC, abstractmethod
-from typing import NamedTuple
+from typing import NamedTuple, Self
 
 import torch
 from torch import Tensor, nn
@@ -21,7 +23,8 @@ class Loss(nn.Module):
     """A sum of robust squared residuals in units of their standard deviation.
 
     Args:
-        sigma: standard deviation of a residual in its own unit; a number, or a tensor with one per point or stick.
+        sigma: standard deviation of a residual in its own unit; a number, or a tensor with one per point or stick. Where it
+            differs between sessions, a tensor that broadcasts against the residuals.
         weight: factor on the whole loss (the paper's lambda).
         kernel: robust kernel on squared whitened residuals.
     """
@@ -34,9 +37,18 @@ class Loss(nn.Module):
         self.weight = weight
         self.kernel = kernel if kernel is not None else Quadratic()
 
-    def total(self, whitened_squared: Tensor) -> Tensor:
-        """The loss of squared whitened residuals, summed."""
-        return self.weight * self.kernel.rho(whitened_squared).sum()
+    def total(self, whitened_squared: Tensor, over: int | None = None) -> Tensor:
+        """The loss of squared whitened residuals, summed over all dimensions or over that many of the last."""
+        rho = self.kernel.rho(whitened_squared)
+        return self.weight * (rho.sum() if over is None else rho.sum(tuple(range(-over, 0)), dtype=torch.float64))
+
+    def of(self, sessions: slice) -> Self:
+        """The same loss for some of the sessions that ``sigma`` has as its first of three dimensions or more."""
+        if self.sigma.ndim < 3:
+            return self
+        part = copy.deepcopy(self)
+        part.sigma = self.sigma[sessions]
+        return part
 
     def information(self, like: Tensor) -> Tensor:
         """1 / sigma^2 in the dtype and on the device of a tensor."""
@@ -47,37 +59,37 @@ class CameraPointTerms(NamedTuple):
     """A camera-point loss, linearised at C cameras and N points."""
 
     cost: Tensor
-    """(): the loss"""
+    """(...): the loss"""
     squares: Tensor
-    """(C,): weighted sum of squared residuals, in pixels"""
+    """(..., C): weighted sum of squared residuals, in pixels"""
     weights: Tensor
-    """(C,): sum of those weights"""
+    """(..., C): sum of those weights"""
     gradient: Tensor
-    """(C, 3, N): half the derivative by the point, in the world's axes"""
+    """(..., C, 3, N): half the derivative by the point, in the world's axes"""
     hessian: Tensor
-    """(C, 6, N): the Gauss-Newton block J^T J by the point, entries xx xy xz yy yz zz"""
+    """(..., C, 6, N): the Gauss-Newton block J^T J by the point, entries xx xy xz yy yz zz"""
 
 
 class PairTerms(NamedTuple):
     """A loss on pairs of points of one frame, linearised at F frames and S pairs."""
 
     cost: Tensor
-    """(): the loss"""
+    """(...): the loss"""
     residual: Tensor
-    """(F, S): weighted residuals"""
+    """(..., F, S): weighted residuals"""
     jacobian: Tensor
-    """(3, F, S): derivative by the pair's second point; by its first point it is the negative"""
+    """(..., 3, F, S): derivative by the pair's second point; by its first point it is the negative"""
 
 
 class TrackTerms(NamedTuple):
     """A loss on the frames of one point, linearised at F frames and P points: residuals ``stencil * track``."""
 
     cost: Tensor
-    """(): the loss"""
+    """(...): the loss"""
     residual: Tensor
-    """(3, F - 2, P): weighted residuals"""
+    """(..., 3, F - 2, P): weighted residuals"""
     scale: Tensor
-    """(F - 2, P): the factor in them; their Jacobian by frames f, f+1, f+2 is scale (1, -2, 1) I"""
+    """(..., F - 2, P): the factor in them; their Jacobian by frames f, f+1, f+2 is scale (1, -2, 1) I"""
 
 
 class CameraPointLoss(Loss, ABC):
@@ -102,10 +114,10 @@ class CameraPointLoss(Loss, ABC):
         """The terms at N points.
 
         Args:
-            points_cam: the points in every camera's frame, (C, 3, N).
-            rotations: world to camera, (C, 3, 3).
-            pixels: (C, 2, N).
-            information: confidence / sigma^2, (C, N), zero where not seen.
+            points_cam: the points in every camera's frame, (..., C, 3, N).
+            rotations: world to camera, (..., C, 3, 3).
+            pixels: (..., C, 2, N).
+            information: confidence / sigma^2, (..., C, N), zero where not seen.
             cameras: the C cameras.
         """
 
@@ -115,7 +127,7 @@ class PairLoss(Loss, ABC):
 
     @abstractmethod
     def linearise(self, difference: Tensor, length_m: Tensor, active: Tensor) -> PairTerms:
-        """Terms at differences (3, F, S) of the pairs' ends, nominal lengths (S,) and a mask (F, S)."""
+        """Terms at differences (..., 3, F, S) of the pairs' ends, nominal lengths (..., 1, S) and a mask (..., F, S)."""
 
 
 class TrackLoss(Loss, ABC):
@@ -123,4 +135,4 @@ class TrackLoss(Loss, ABC):
 
     @abstractmethod
     def linearise(self, points: Tensor, active: Tensor) -> TrackTerms:
-        """Terms at points (3, F, P) with a mask (F, P) of points that exist."""
+        """Terms at points (..., 3, F, P) with a mask (..., F, P) of points that exist."""

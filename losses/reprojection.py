@@ -15,18 +15,19 @@ def reprojection_residuals(
     """Projection minus keypoint, in (distorted) pixels; the paper's residuals of stage 1, negated.
 
     Args:
-        points: (F, P, 3), metres, world.
-        rotations: (C, 3, 3) and translations: (C, 3), world to camera.
-        keypoints: (C, F, P, 2), NaN where not seen.
-        intrinsics: cameras with their lenses, or matrices (C, 3, 3) or (3, 3).
+        points: (..., F, P, 3), metres, world; any leading dimensions, of several sessions, are those of all the others.
+        rotations: (..., C, 3, 3) and translations: (..., C, 3), world to camera.
+        keypoints: (..., C, F, P, 2), NaN where not seen.
+        intrinsics: cameras with their lenses, or matrices (..., C, 3, 3) or (3, 3).
 
     Returns:
-        (C, F, P, 2), zero where a keypoint was not seen or its point is not known.
+        (..., C, F, P, 2), zero where a keypoint was not seen or its point is not known.
     """
     cameras = _as_intrinsics(intrinsics, rotations)
-    seen = keypoints.isfinite().all(-1, keepdim=True) & points.isfinite().all(-1, keepdim=True)
+    seen = keypoints.isfinite().all(-1, keepdim=True) & points.isfinite().all(-1, keepdim=True).unsqueeze(-4)
     in_front = torch.tensor([0.0, 0.0, 1.0]).to(points)
-    points_cam = torch.einsum("cij,fpj->cfpi", rotations, points.nan_to_num()) + translations[:, None, None]
+    points_cam = torch.einsum("...cij,...fpj->...cfpi", rotations, points.nan_to_num())
+    points_cam = points_cam + translations[..., None, None, :]
     projected = cameras.project(torch.where(seen, points_cam, in_front))
     return torch.where(seen, projected - keypoints.nan_to_num(), torch.zeros_like(projected))
 
@@ -58,20 +59,20 @@ class ReprojectionLoss(CameraPointLoss):
     ) -> CameraPointTerms:
         # The derivative of (u, v) by the world point has the rows p / z and q / z, p = r1 - u r3 and q = r2 - v r3 with the
         # rows r of the rotation; M, the derivative of the pixel by (u, v), gives J^T W J = [p q] (M^T W M / z^2) [p q]^T.
-        x, y, z = points_cam.unbind(1)
+        x, y, z = points_cam.unbind(-2)
         inverse_depth = inverse_depths(z)
         u, v = x * inverse_depth, y * inverse_depth
         m = cameras.pixels_with_jacobian(u, v)
-        rx, ry = m.x - pixels[:, 0], m.y - pixels[:, 1]
+        rx, ry = m.x - pixels[..., 0, :], m.y - pixels[..., 1, :]
         squared_px = rx.square().addcmul_(ry, ry)
         squared = squared_px * information
         weights = information * self.kernel.weight(squared)
         if self.weight != 1.0:
             weights = weights * self.weight
 
-        first, second, third = rotations[..., None].unbind(1)
-        p = torch.addcmul(first, u[:, None], third, value=-1)
-        q = torch.addcmul(second, v[:, None], third, value=-1)
+        first, second, third = rotations[..., None].unbind(-3)
+        p = torch.addcmul(first, u.unsqueeze(-2), third, value=-1)
+        q = torch.addcmul(second, v.unsqueeze(-2), third, value=-1)
         gradient = p * _scaled(weights, m.dx_du, rx, m.dy_du, ry, inverse_depth)
         gradient.addcmul_(q, _scaled(weights, m.dx_dv, rx, m.dy_dv, ry, inverse_depth))
 
@@ -81,26 +82,27 @@ class ReprojectionLoss(CameraPointLoss):
         t = p * pq
         s.addcmul_(q, pq)
         t.addcmul_(q, _scaled(weights_at_depth, m.dx_dv, m.dx_dv, m.dy_dv, m.dy_dv))
-        hessian = p.new_empty(p.shape[0], 6, p.shape[2])
+        hessian = p.new_empty(*p.shape[:-2], 6, p.shape[-1])
         for entries, axis in ((slice(0, 3), 0), (slice(3, 5), 1), (slice(5, 6), 2)):
-            torch.mul(p[:, axis : axis + 1], s[:, axis:], out=hessian[:, entries])
-            hessian[:, entries].addcmul_(q[:, axis : axis + 1], t[:, axis:])
+            block = hessian[..., entries, :]
+            torch.mul(p[..., axis : axis + 1, :], s[..., axis:, :], out=block)
+            block.addcmul_(q[..., axis : axis + 1, :], t[..., axis:, :])
         return CameraPointTerms(
-            cost=self.total(squared),
-            squares=(weights * squared_px).sum(1),
-            weights=weights.sum(1),
+            cost=self.total(squared, over=2),
+            squares=(weights * squared_px).sum(-1),
+            weights=weights.sum(-1),
             gradient=gradient,
             hessian=hessian,
         )
 
 
 def _scaled(weights: Tensor, a: Tensor, b: Tensor, c: Tensor, d: Tensor, factor: Tensor | None = None) -> Tensor:
-    """``weights (a b + c d) factor`` as (C, 1, N)."""
+    """``weights (a b + c d) factor`` as (..., C, 1, N)."""
     scaled = weights * torch.addcmul(a * b, c, d)
-    return (scaled if factor is None else scaled * factor)[:, None]
+    return (scaled if factor is None else scaled * factor).unsqueeze(-2)
 
 
 def _as_intrinsics(intrinsics: Intrinsics | Tensor, rotations: Tensor) -> Intrinsics:
     if isinstance(intrinsics, Intrinsics):
         return intrinsics
-    return Intrinsics(intrinsics.expand(rotations.shape[0], 3, 3))
+    return Intrinsics(intrinsics.expand_as(rotations))

@@ -9,8 +9,8 @@ from torchstickcal.losses.base import TrackLoss, TrackTerms
 
 
 def second_differences(points: Tensor) -> Tensor:
-    """``X[f-1] - 2 X[f] + X[f+1]``, (F - 2, P, 3), of points (F, P, 3); zero where one of the three is NaN."""
-    difference = stencil(points, dim=0)
+    """``X[f-1] - 2 X[f] + X[f+1]``, (..., F - 2, P, 3), of points (..., F, P, 3); zero where one of the three is NaN."""
+    difference = stencil(points, dim=-3)
     return torch.where(difference.isfinite().all(-1, keepdim=True), difference, torch.zeros_like(difference))
 
 
@@ -21,8 +21,8 @@ def stencil(values: Tensor, dim: int) -> Tensor:
 
 
 def complete_triples(present: Tensor) -> Tensor:
-    """(F - 2, ...), True where a point is present in three frames in a row, of a mask (F, ...)."""
-    return present[2:] & present[1:-1] & present[:-2]
+    """(..., F - 2, P), True where a point is present in three frames in a row, of a mask (..., F, P)."""
+    return present[..., 2:, :] & present[..., 1:-1, :] & present[..., :-2, :]
 
 
 class SmoothnessLoss(TrackLoss):
@@ -35,14 +35,14 @@ class SmoothnessLoss(TrackLoss):
     """
 
     def forward(self, points: Tensor) -> Tensor:
-        """The loss of points (F, P, 3); NaN points take no part."""
+        """The loss of points (..., F, P, 3); NaN points take no part."""
         complete = complete_triples(points.isfinite().all(-1))
         squared = second_differences(points.nan_to_num()).square().sum(-1) * complete
         return self.total(squared * self.information(squared))
 
     def linearise(self, points: Tensor, active: Tensor) -> TrackTerms:
         complete = complete_triples(active)
-        difference = stencil(points, dim=1) * complete
-        squared = difference.square().sum(0) * self.information(difference)
+        difference = stencil(points, dim=-2) * complete.unsqueeze(-3)
+        squared = difference.square().sum(-3) * self.information(difference)
         scale = (self.weight * self.information(difference) * self.kernel.weight(squared)).sqrt() * complete
-        return TrackTerms(cost=self.total(squared), residual=difference * scale, scale=scale)
+        return TrackTerms(cost=self.total(squared, over=2), residual=difference * scale.unsqueeze(-3), scale=scale)

@@ -25,21 +25,21 @@ class StickLengthLoss(PairLoss):
     """
 
     def forward(self, starts: Tensor, ends: Tensor, length_m: float | Tensor) -> Tensor:
-        """The loss of stick ends (F, S, 3) or (F, 3); frames in which an end is NaN do not count."""
+        """The loss of stick ends (..., F, S, 3) or (F, 3); frames in which an end is NaN do not count."""
         known = (starts + ends).isfinite().all(-1)
         lengths = stick_lengths(starts.nan_to_num(), ends.nan_to_num())
         residuals = torch.where(known, lengths - length_m, torch.zeros_like(lengths))
         return self.total(residuals.square() * self.information(residuals))
 
     def linearise(self, difference: Tensor, length_m: Tensor, active: Tensor) -> PairTerms:
-        length = _length(difference, dim=0)
+        length = _length(difference, dim=-3)
         residual = (length - length_m) * active
         squared = residual.square() * self.information(residual)
         scale = (self.weight * self.information(residual) * self.kernel.weight(squared)).sqrt() * active
         return PairTerms(
-            cost=self.total(squared),
+            cost=self.total(squared, over=2),
             residual=residual * scale,
-            jacobian=difference * (scale / length),
+            jacobian=difference * (scale / length).unsqueeze(-3),
         )
 
 

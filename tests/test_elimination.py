@@ -7,9 +7,12 @@ import torch
 from torch import Tensor
 
 from torchstickcal import se3
+from torchstickcal.cameras import Intrinsics
+from torchstickcal.problem import Measurements
 from torchstickcal.solvers.cross_blocks import cross_rows, symmetric_times
-from torchstickcal.solvers.point_elimination import PointElimination
-from torchstickcal.solvers.track_elimination import BlockTridiagonal, TrackElimination
+from torchstickcal.solvers.parts import Couplings, Part, parts
+from torchstickcal.solvers.track_elimination import BlockTridiagonal
+from torchstickcal.symmetric import expand, inverse_diagonal
 
 P = 5
 PAIRS = torch.tensor([[3, 4], [1, 0]])
@@ -56,52 +59,80 @@ def flat(columns: Tensor) -> Tensor:
     return columns.mT.flatten()
 
 
-def check(elimination: PointElimination | TrackElimination, dense: Tensor, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Against dense algebra, for random blocks N_c of two cameras and a random gradient."""
-    count = dense.shape[0] // 3
-    cross, points, gradient = (torch.randn(*shape, count, dtype=torch.float64) for shape in ((2, 6), (3,), (3,)))
-    coupling = torch.stack([flat(row) for row in cross_rows(cross, points).flatten(0, 1)])
-    right = torch.cat([coupling, flat(gradient)[None]])
+def check(part: Part, hessian: Tensor, dense: Tensor) -> None:
+    """A part that holds all columns, against dense algebra, for random blocks N_c of two cameras and a random gradient."""
+    count = hessian.shape[1]
+    generator = torch.Generator().manual_seed(count)
+    shapes = ((1, 2, 6, count), (1, 3, count), (1, 3, count))
+    cross, points, gradient = (torch.randn(*shape, generator=generator, dtype=torch.float64) for shape in shapes)
+    coupling = torch.stack([flat(row) for row in cross_rows(cross, points)[0].flatten(0, 1)])
+    right = torch.cat([coupling, flat(gradient[0])[None]])
     expected = right @ torch.linalg.solve(dense, right.mT)
-    for part in (10**6, 2 * P):
-        monkeypatch.setattr("torchstickcal.solvers.point_elimination._PART_KEYPOINTS", 2 * part)
-        gram = torch.zeros_like(expected)
-        for rows, half in elimination.reductions(cross, points, gradient):
-            both = torch.cat([rows, half[None]])
-            gram += both @ both.mT
-        torch.testing.assert_close(gram, expected, rtol=1e-11, atol=1e-11 * float(expected.abs().max()))
-    solution = torch.linalg.solve(dense, flat(gradient))
-    torch.testing.assert_close(flat(elimination.solve(gradient)), solution, rtol=1e-11, atol=1e-12)
+    columns = part.columns
+    elimination = part.eliminate(hessian[None, :, columns])
+    rows, half = elimination.reductions(cross[..., columns], points[..., columns], gradient[..., columns])
+    both = torch.cat([rows, half[:, None]], dim=1)[0]
+    torch.testing.assert_close(both @ both.mT, expected, rtol=1e-11, atol=1e-11 * float(expected.abs().max()))
+    solution = torch.empty_like(gradient)
+    solution[..., columns] = elimination.solve(gradient[..., columns])
+    torch.testing.assert_close(flat(solution[0]), torch.linalg.solve(dense, flat(gradient[0])), rtol=1e-11, atol=1e-12)
+
+
+def session(frames: int, pairs: Tensor) -> Measurements:
+    """Nothing but the shape of a session of one camera."""
+    cameras = Intrinsics(torch.eye(3, dtype=torch.float64)[None, None])
+    pixels, confidence = torch.zeros(1, 1, 2, frames * P), torch.ones(1, 1, frames * P)
+    return Measurements(pixels, confidence, cameras, frames, pairs, torch.ones(1, len(pairs)))
 
 
 def test_cross_rows_are_blocks_times_the_cameras_jacobian():
     blocks, points = torch.randn(2, 6, 7, dtype=torch.float64), torch.randn(3, 7, dtype=torch.float64)
-    matrices = blocks[:, [0, 1, 2, 1, 3, 4, 2, 4, 5]].unflatten(1, (3, 3)).movedim(-1, 1)
+    matrices = expand(blocks).movedim(-1, 1)
     jacobian = torch.cat([torch.eye(3, dtype=torch.float64).expand(7, 3, 3), -se3.hat(points.mT)], dim=-1)
-    torch.testing.assert_close(cross_rows(blocks, points).permute(0, 3, 2, 1), matrices @ jacobian)
+    rows = cross_rows(blocks[None], points[None])[0]
+    torch.testing.assert_close(rows.permute(0, 3, 2, 1), matrices @ jacobian)
     vectors = torch.randn(2, 3, 7, dtype=torch.float64)
     expected = (matrices @ vectors.movedim(-1, 1)[..., None])[..., 0].sum(0).mT
-    torch.testing.assert_close(symmetric_times(blocks, vectors), expected)
+    torch.testing.assert_close(symmetric_times(blocks[None], vectors[None])[0], expected)
 
 
 @pytest.mark.parametrize("frames", [2, 3, 7])
-def test_points_and_sticks(frames: int, monkeypatch: pytest.MonkeyPatch):
+def test_points_and_sticks(frames: int):
     dense, blocks, coupling, *_ = system(frames, smooth=False)
-    check(PointElimination(blocks, PAIRS, coupling), dense, monkeypatch)
+    (part,) = parts(session(frames, PAIRS), Couplings(coupling[None], None, None))
+    check(part, blocks.flatten(1), dense)
 
 
-def test_points_alone(monkeypatch: pytest.MonkeyPatch):
+def test_points_alone():
     _, blocks, *_ = system(4, smooth=False)
-    matrices = blocks.flatten(1)[[0, 1, 2, 1, 3, 4, 2, 4, 5]].mT.reshape(-1, 3, 3)
-    elimination = PointElimination(blocks, PAIRS, None)
-    check(elimination, torch.block_diag(*matrices), monkeypatch)
-    torch.testing.assert_close(elimination.variances().mT, torch.linalg.inv(matrices).diagonal(dim1=1, dim2=2))
+    matrices = expand(blocks.flatten(1)).movedim(-1, 0)
+    (part,) = parts(session(4, PAIRS), Couplings(None, None, None))
+    check(part, blocks.flatten(1), torch.block_diag(*matrices))
+    found = inverse_diagonal(blocks.flatten(1))
+    torch.testing.assert_close(found.mT, torch.linalg.inv(matrices).diagonal(dim1=1, dim2=2))
 
 
 @pytest.mark.parametrize("frames", [3, 4, 5, 8, 11])
-def test_tracks(frames: int, monkeypatch: pytest.MonkeyPatch):
+@pytest.mark.parametrize("together", [1, 1000])
+def test_tracks(frames: int, together: int, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr("torchstickcal.solvers.parts._TRACK_POINTS", together)
     dense, blocks, coupling, next_frame, second_frame = system(frames, smooth=True)
-    check(TrackElimination(blocks, PAIRS, coupling, next_frame, second_frame), dense, monkeypatch)
+    by_point = dense.reshape(frames, P, 3, frames, P, 3)
+    found = parts(session(frames, PAIRS), Couplings(coupling[None], next_frame[None], second_frame[None]))
+    assert sorted(torch.cat([part.columns for part in found]).tolist()) == list(range(frames * P))
+    for part in found:
+        members = torch.unique(part.columns % P)
+        inside = by_point[:, members][:, :, :, :, members].reshape(frames * len(members) * 3, -1)
+        order = torch.empty(frames * P, dtype=torch.long)
+        order[(torch.arange(frames)[:, None] * P + members).flatten()] = torch.arange(frames * len(members))
+        check(_Renumbered(part, order[part.columns]), blocks[..., members].flatten(1), inside)
+
+
+class _Renumbered:
+    """A part of some points as a part that holds all columns of a session of these points."""
+
+    def __init__(self, part: Part, columns: Tensor) -> None:
+        self.columns, self.chunks, self.eliminate = columns, [columns], part.eliminate
 
 
 @pytest.mark.parametrize("count", [1, 2, 3, 6, 9])

@@ -24,10 +24,11 @@ def test_rig_comes_back_up_to_scale(cameras: int):
     observations, truth = golf_session(cameras=cameras, frames=40, noise=Noise(0.5, missing=0.1, outliers=0.05))
     state = initialise(Measurements.of(observations), InitialiseSettings(), [str(k) for k in range(cameras)])
     relative = truth.rotations @ truth.rotations[0].mT
-    assert metrics.rotation_angle(state.rotations @ relative.mT).rad2deg().max() < 1.5
-    assert torch.equal(state.rotations[0], torch.eye(3, dtype=torch.float64))
+    rotations, translations = state.rotations[0], state.translations[0]
+    assert metrics.rotation_angle(rotations @ relative.mT).rad2deg().max() < 1.5
+    assert torch.equal(rotations[0], torch.eye(3, dtype=torch.float64))
     centres = -(relative.mT @ (truth.translations - (relative @ truth.translations[0]))[..., None])[..., 0]
-    found = -(state.rotations.mT @ state.translations[..., None])[..., 0]
+    found = -(rotations.mT @ translations[..., None])[..., 0]
     ratios = found[1:].norm(dim=1) / centres[1:].norm(dim=1)
     assert (ratios.max() / ratios.min()) < 1.1
 
@@ -78,9 +79,9 @@ def test_a_third_view_tells_the_true_pose_from_its_twin():
 def test_triangulation_is_exact_and_ignores_an_outlier():
     observations, truth = golf_session(cameras=5, frames=4)
     measurements = Measurements.of(observations)
-    rays = measurements.cameras.undistort(measurements.pixels.movedim(1, -1)).movedim(-1, 1)
+    rays = measurements.cameras[0].undistort(measurements.pixels[0].movedim(1, -1)).movedim(-1, 1)
     expected = truth.points.flatten(0, 1).mT
-    weights = measurements.confidence.clone()
+    weights = measurements.confidence[0].clone()
     found = triangulate(truth.rotations, truth.translations, rays, weights, scale=0.01)
     torch.testing.assert_close(found, expected, rtol=0, atol=1e-10)
     rays[2, :, 7] += 0.2

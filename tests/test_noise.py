@@ -26,11 +26,12 @@ def test_points_of_different_noise_are_told_apart_and_alike_ones_are_treated_ali
     noise = torch.randn(observations.keypoints.shape, generator=generator, dtype=torch.float64)
 
     def estimated(sigma: torch.Tensor) -> torch.Tensor:
-        pixels = (observations.keypoints + sigma[:, None] * noise).movedim(-1, 1).flatten(2)
+        pixels = (observations.keypoints + sigma[:, None] * noise).movedim(-1, 1).flatten(2)[None]
         measurements = Measurements.of(observations)
         measurements = Measurements(pixels, measurements.confidence, *list(vars(measurements).values())[2:])
-        state = State(truth.rotations, truth.translations, truth.points.flatten(0, 1).mT.contiguous())
-        return estimate_sigma_px(measurements, measurements.squared_residuals(state))
+        points = truth.points.flatten(0, 1).mT.contiguous()
+        state = State(truth.rotations[None], truth.translations[None], points[None])
+        return estimate_sigma_px(measurements, measurements.squared_residuals(state))[0]
 
     alike = estimated(sigma)
     assert alike.max() / alike.min() < 1.02
@@ -48,5 +49,5 @@ def test_acceleration_is_separated_from_noise():
     noise = 0.003 * torch.randn(shape, generator=generator, dtype=torch.float64)
     points = (steps.cumsum(1).cumsum(1) + noise).flatten(1)
     variance = torch.full((points.shape[1],), 0.003**2, dtype=torch.float64)
-    found = estimate_acceleration_m(measurements, points, variance)
+    (found,) = estimate_acceleration_m(measurements, points[None], variance[None])
     torch.testing.assert_close(found, torch.full_like(found, 0.01), rtol=0.1, atol=0)

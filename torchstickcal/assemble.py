@@ -11,29 +11,38 @@ from torchstickcal.losses import reprojection_residuals
 from torchstickcal.observations import Observations
 from torchstickcal.problem import Measurements
 from torchstickcal.result import Calibration
-from torchstickcal.stages import StageResult
+from torchstickcal.stages import StageRecord, StageResult
 
 _USELESS_FOCAL_SHARE = 0.03
 
 
 def assemble(
-    observations: Observations, measurements: Measurements, stages: Sequence[StageResult], seconds: Mapping[str, float]
+    observations: Observations,
+    measurements: Measurements,
+    reached: StageResult,
+    stages: Sequence[StageRecord],
+    seconds: Mapping[str, float],
+    session: int = 0,
 ) -> Calibration:
-    """The calibration that the last of the stages has reached.
+    """The calibration of one session that the last of the stages has reached.
 
     Args:
-        observations: as the user gave them.
-        measurements: all that could take part.
-        stages: what the stages ended with, in order.
+        observations: the session as the user gave it.
+        measurements: all that could take part, of all sessions solved together.
+        reached: what the last stage ended with.
+        stages: the records of this session's stages, in order.
         seconds: time by step.
+        session: which of the sessions solved together it is.
     """
-    state, used, sigma_px = stages[-1].state, stages[-1].measurements, stages[-1].sigma_px
-    points = used.by_frame(state.points.where(used.active, torch.nan)).movedim(0, -1)
+    one = slice(session, session + 1)
+    measurements, inliers, sigma_px = measurements[one], reached.inliers[session], reached.sigma_px[session]
+    rotations, translations = reached.state.rotations[session], reached.state.translations[session]
+    points = measurements.by_frame(reached.state.points[session].where(inliers.any(0), torch.nan)).movedim(0, -1)
     residuals = torch.empty_like(observations.keypoints, dtype=torch.float64)
-    for frames in used.frame_slices():
+    for frames in measurements.frame_slices():
         seen = (observations.visible[:, frames] & points[frames].isfinite().all(-1))[..., None]
         keypoints = observations.keypoints[:, frames].double()
-        found = reprojection_residuals(points[frames], state.rotations, state.translations, keypoints, used.cameras)
+        found = reprojection_residuals(points[frames], rotations, translations, keypoints, measurements.cameras[0])
         residuals[:, frames] = found.where(seen, torch.nan)
     starts, ends = [stick.start for stick in observations.sticks], [stick.end for stick in observations.sticks]
     distortion, size, cameras = observations.distortion, observations.image_size, observations.num_cameras
@@ -42,11 +51,11 @@ def assemble(
         return tensor.to(observations.keypoints.dtype).contiguous()
 
     return Calibration(
-        rotations=as_given(state.rotations),
-        translations=as_given(state.translations),
+        rotations=as_given(rotations),
+        translations=as_given(translations),
         points=as_given(points),
         residuals_px=as_given(residuals),
-        inliers=used.by_frame(used.visible),
+        inliers=measurements.by_frame(inliers),
         stick_lengths_m=as_given((points[:, ends] - points[:, starts]).norm(dim=-1)),
         sigma_px=as_given(sigma_px),
         intrinsics=as_given(observations.cameras.matrix),
@@ -57,16 +66,16 @@ def assemble(
         fps=observations.fps,
         point_names=observations.point_names,
         camera_names=tuple(observations.camera_label(index) for index in range(cameras)),
-        stages=tuple(stage.record for stage in stages),
+        stages=tuple(stages),
         seconds=dict(seconds),
-        warnings=_warnings(observations, measurements, used, sigma_px),
+        warnings=_warnings(observations, measurements, inliers, sigma_px),
     )
 
 
-def _warnings(observations: Observations, measurements: Measurements, used: Measurements, sigma_px: Tensor) -> tuple[str, ...]:
+def _warnings(observations: Observations, measurements: Measurements, inliers: Tensor, sigma_px: Tensor) -> tuple[str, ...]:
     found: list[str] = []
-    comparable, kept = int(measurements.visible.sum()), int(used.visible.sum())
-    seen = int(observations.visible[:, :, measurements.by_frame(measurements.active).any(0)].sum())
+    comparable, kept = int(measurements.visible.sum()), int(inliers.sum())
+    seen = int(observations.visible[:, :, measurements.by_frame(measurements.active[0]).any(0)].sum())
     if seen > comparable:
         found.append(f"{seen - comparable} of {seen} keypoints took no part: no second camera saw the point.")
     if comparable > kept:

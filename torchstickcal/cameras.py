@@ -32,7 +32,7 @@ class Distorted(NamedTuple):
 
 
 class PixelMap(NamedTuple):
-    """Pixels of normalised coordinates, with derivatives; (C, N), or (C, 1) where a derivative is the same for all."""
+    """Pixels of normalised coordinates, with derivatives; (..., C, N), or (..., C, 1) where one is the same for all."""
 
     x: Tensor
     y: Tensor
@@ -44,12 +44,12 @@ class PixelMap(NamedTuple):
 
 @dataclass(frozen=True)
 class Intrinsics:
-    """The intrinsics of C cameras.
+    """The intrinsics of C cameras, or of C cameras in each of several sessions: any leading dimensions before C.
 
     Args:
-        matrix: camera matrices K, (C, 3, 3), pixels.
-        distortion: lens coefficients in OpenCV's order, (C, 4 | 5 | 8), or None for a perfect lens.
-        fisheye: whether ``distortion`` (C, 4) is of OpenCV's fisheye model.
+        matrix: camera matrices K, (..., C, 3, 3), pixels.
+        distortion: lens coefficients in OpenCV's order, (..., C, 4 | 5 | 8), or None for a perfect lens.
+        fisheye: whether ``distortion`` (..., C, 4) is of OpenCV's fisheye model.
     """
 
     matrix: Tensor
@@ -61,27 +61,31 @@ class Intrinsics:
         distortion = None if self.distortion is None else self.distortion.to(*args, **kwargs)  # type: ignore[call-overload]
         return Intrinsics(self.matrix.to(*args, **kwargs), distortion, self.fisheye)  # type: ignore[call-overload]
 
-    def __getitem__(self, cameras: slice | list[int]) -> Intrinsics:
-        """Some of the cameras."""
-        return Intrinsics(self.matrix[cameras], None if self.distortion is None else self.distortion[cameras], self.fisheye)
+    def __getitem__(self, index: int | slice | list[int] | Tensor) -> Intrinsics:
+        """Those at an index of the first dimension."""
+        return Intrinsics(self.matrix[index], None if self.distortion is None else self.distortion[index], self.fisheye)
+
+    def batched(self) -> Intrinsics:
+        """The cameras of one session as those of a batch of one."""
+        return Intrinsics(self.matrix[None], None if self.distortion is None else self.distortion[None], self.fisheye)
 
     @property
     def focal_px(self) -> Tensor:
-        """Mean focal length of each camera, (C,), pixels."""
-        return (self.matrix[:, 0, 0] + self.matrix[:, 1, 1]) / 2
+        """Mean focal length of each camera, (..., C), pixels."""
+        return (self.matrix[..., 0, 0] + self.matrix[..., 1, 1]) / 2
 
     def project(self, points_cam: Tensor) -> Tensor:
-        """Pixels (C, ..., 2) of points (C, ..., 3) in the cameras' own frames, metres."""
+        """Pixels (..., C, ..., 2) of points (..., C, ..., 3) in the cameras' own frames, metres."""
         return torch.stack(self.project_components(*points_cam.unbind(-1)), dim=-1)
 
     def project_components(self, x: Tensor, y: Tensor, z: Tensor) -> tuple[Tensor, Tensor]:
-        """Pixel coordinates of points given as three tensors (C, ...)."""
+        """Pixel coordinates of points given as three tensors (..., C, ...)."""
         inverse_depth = inverse_depths(z)
         return self._to_pixels(*self.distort(x * inverse_depth, y * inverse_depth))
 
     def pixels_with_jacobian(self, u: Tensor, v: Tensor) -> PixelMap:
-        """Pixel coordinates of normalised coordinates (C, N), with their derivatives."""
-        fx, skew, _, fy, _ = self._pixel_map(2)
+        """Pixel coordinates of normalised coordinates (..., C, N), with their derivatives."""
+        fx, skew, _, fy, _ = self._pixel_map(u.ndim)
         if self.distortion is None:
             return PixelMap(*self._to_pixels(u, v), fx, skew, torch.zeros_like(fx), fy)
         lens = self.distort_with_jacobian(u, v)
@@ -94,7 +98,7 @@ class Intrinsics:
         )
 
     def distort(self, u: Tensor, v: Tensor) -> tuple[Tensor, Tensor]:
-        """Apply the lenses to normalised coordinates, two tensors (C, ...)."""
+        """Apply the lenses to normalised coordinates, two tensors (..., C, ...)."""
         if self.distortion is None:
             return u, v
         if self.fisheye:
@@ -123,7 +127,7 @@ class Intrinsics:
         )
 
     def undistort(self, pixels: Tensor) -> Tensor:
-        """Normalised coordinates (C, ..., 2) of pixels (C, ..., 2), by Newton's method run to convergence.
+        """Normalised coordinates (..., C, ..., 2) of pixels (..., C, ..., 2), by Newton's method run to convergence.
 
         NaN where the pixel is NaN and where no point in front of the lens maps to it: beyond the radius at which the
         lens model folds back.
@@ -144,14 +148,14 @@ class Intrinsics:
             if not bool((torch.maximum(error_u.abs(), error_v.abs()) > _UNDISTORT_TOLERANCE).any()):
                 break
         back_u, back_v = self.distort(u, v)
-        fold_radius = self._fold_radius.view(-1, *[1] * (u.ndim - 1))
+        fold_radius = _broadcast(self._fold_radius, u.ndim)
         solved = ((back_u - u_target).abs() + (back_v - v_target).abs() < 1e-9) & (u * u + v * v < fold_radius**2)
         return torch.where(solved[..., None], torch.stack([u, v], dim=-1), torch.nan)
 
     def _pixel_map(self, ndim: int) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
-        """fx, skew, cx, fy, cy, each (C, 1, ...) for coordinates of ``ndim`` dimensions."""
-        matrix = self.matrix.view(-1, 3, 3, *[1] * (ndim - 1))
-        return matrix[:, 0, 0], matrix[:, 0, 1], matrix[:, 0, 2], matrix[:, 1, 1], matrix[:, 1, 2]
+        """fx, skew, cx, fy, cy, each (..., C, 1, ...) for coordinates of ``ndim`` dimensions."""
+        fx, skew, cx, _, fy, cy, *_ = _broadcast(self.matrix.flatten(-2).movedim(-1, 0), ndim + 1)
+        return fx, skew, cx, fy, cy
 
     def _to_pixels(self, u: Tensor, v: Tensor) -> tuple[Tensor, Tensor]:
         fx, skew, cx, fy, cy = self._pixel_map(u.ndim)
@@ -159,13 +163,13 @@ class Intrinsics:
 
     @property
     def _has_denominator(self) -> bool:
-        return self.distortion is not None and self.distortion.shape[1] > 5
+        return self.distortion is not None and self.distortion.shape[-1] > 5
 
     def _coefficients(self, ndim: int) -> list[Tensor]:
         assert self.distortion is not None
-        padding = 0 if self.fisheye else 8 - self.distortion.shape[1]
+        padding = 0 if self.fisheye else 8 - self.distortion.shape[-1]
         padded = torch.nn.functional.pad(self.distortion, (0, padding))
-        return list(padded.view(*padded.shape, *[1] * (ndim - 1)).unbind(1))
+        return list(_broadcast(padded.movedim(-1, 0), ndim + 1))
 
     def _rational(self, u: Tensor, v: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
         """Radial factor, its derivative by r^2, p1, p2 and r^2."""
@@ -194,9 +198,9 @@ class Intrinsics:
 
     @cached_property
     def _fold_radius(self) -> Tensor:
-        """Normalised radius (C,) up to which the radial model is one-to-one."""
+        """Normalised radius (..., C) up to which the radial model is one-to-one."""
         radii = torch.linspace(0, _FOLD_SEARCH_RADIUS, _FOLD_SEARCH_STEPS, dtype=self.matrix.dtype)
-        radii = radii.to(self.matrix.device).expand(self.matrix.shape[0], -1)
+        radii = radii.to(self.matrix.device).expand(*self.matrix.shape[:-2], -1)
         if self.fisheye:
             scale, slope = self._fisheye(radii, torch.zeros_like(radii))
             growth = scale + slope * radii**2
@@ -205,9 +209,14 @@ class Intrinsics:
             growth = radial + 2 * slope * radii**2
         folded = (growth <= 0) | ~growth.isfinite()
         limits = torch.where(folded, radii, torch.inf)
-        return limits.amin(dim=1)
+        return limits.amin(dim=-1)
 
 
 def inverse_depths(depth: Tensor) -> Tensor:
     """1 / z, bounded where z is nearly 0."""
     return depth.reciprocal().clamp(-_MAX_INVERSE_DEPTH, _MAX_INVERSE_DEPTH)
+
+
+def _broadcast(per_camera: Tensor, ndim: int) -> Tensor:
+    """A tensor of values per camera with dimensions of 1 appended, ``ndim`` dimensions in all."""
+    return per_camera.reshape(*per_camera.shape, *[1] * (ndim - per_camera.ndim))

@@ -64,6 +64,18 @@ def _parser() -> argparse.ArgumentParser:
     command.set_defaults(run=_benchmark)
 
     command = commands.add_parser(
+        "simulate",
+        help="generate sessions with truth",
+        description="Generate sessions with truth: a preset, or a sport seen by six cameras.",
+    )
+    command.add_argument("name", metavar="PRESET|SPORT", help="what to generate; a wrong name lists what there is")
+    command.add_argument("--out", metavar="DIR", type=Path, required=True, help="folder for the sessions, made if need be")
+    command.add_argument("--count", metavar="N", type=int, help="how many sessions (default: all of a preset, one of a sport)")
+    command.add_argument("--seed", metavar="N", type=int, default=0, help="added to the sessions' own seeds (default: 0)")
+    command.add_argument("--gif", action="store_true", help="draw each session as an animation beside it")
+    command.set_defaults(run=_simulate)
+
+    command = commands.add_parser(
         "demo",
         help="calibrate a generated golf swing",
         description="Generate a golf swing seen by six cameras, with noise, gaps and outliers; calibrate it; show the result.",
@@ -151,6 +163,24 @@ def _benchmark(options: argparse.Namespace) -> int:
         print(f"{'mean':{width}}  {mean}  {'':9}  {summary['converged']} of {len(scores)} converged")
     _write_json(options.json, summary)
     return EXIT_DONE if scores and summary["converged"] == len(scores) else EXIT_NOT_CONVERGED
+
+
+def _simulate(options: argparse.Namespace) -> int:
+    from torchstickcal.simulate import session_specs, write_simulated
+    from torchstickcal.simulate.render import write_film
+
+    specs = session_specs(options.name, options.count, options.seed)
+    options.out.mkdir(parents=True, exist_ok=True)
+    width = max(len(spec.name) for spec in specs)
+    for number, spec in enumerate(specs, 1):
+        end = "\r" if sys.stderr.isatty() and number < len(specs) else "\n"
+        print(f"{number}/{len(specs)} {spec.name:{width}}", end=end, file=sys.stderr, flush=True)
+        session = spec.generate()
+        write_simulated(options.out / f"{spec.name}.npz", session)
+        if options.gif:
+            write_film(options.out / f"{spec.name}.gif", session)
+    print(f"{len(specs)} session{'s' if len(specs) > 1 else ''} in {options.out}")
+    return EXIT_DONE
 
 
 def _demo(options: argparse.Namespace) -> int:

@@ -20,7 +20,7 @@ _DISCERNIBLE_SHARE = 0.01
 
 
 def estimate_sigma_px(measurements: Measurements, squared_residuals: Tensor) -> Tensor:
-    """Standard deviation of a keypoint along each axis, (P,), pixels, for every point of the skeleton and the sticks.
+    """Standard deviation of a keypoint along each axis, (B, P), pixels, for every point of the skeleton and the sticks.
 
     From the residuals of the adjustment: their second moment inside a cut of 4 standard deviations, corrected for the part
     cut off and for the three degrees of freedom each 3D point has taken. Estimates of single points are drawn towards
@@ -28,52 +28,53 @@ def estimate_sigma_px(measurements: Measurements, squared_residuals: Tensor) -> 
     points that are alike are treated alike. Of a long session some thousand frames, evenly spread, are looked at.
 
     Args:
-        measurements: the session.
-        squared_residuals: (C, N), of :meth:`Measurements.squared_residuals`.
+        measurements: the sessions.
+        squared_residuals: (B, C, N), of :meth:`Measurements.squared_residuals`.
     """
     frames = torch.linspace(0, measurements.frames - 1, min(measurements.frames, _MAX_FRAMES)).round().long()
-    visible = measurements.by_frame(measurements.visible)[:, frames]
-    squared = measurements.by_frame(squared_residuals)[:, frames]
+    visible = measurements.by_frame(measurements.visible)[:, :, frames]
+    squared = measurements.by_frame(squared_residuals)[:, :, frames].double()
     variance = _first_guess(squared, visible)
     for _ in range(_ROUNDS):
-        kept = visible & (squared <= _CUT**2 * variance)
-        views = kept.sum(0)
-        kept = kept & (views >= 2)
-        freedom = (2 * kept.sum(0) - 3).clamp_min(0).sum(0).to(squared)
-        variance = squared.where(kept, 0.0).sum((0, 1)) / freedom.clamp_min(1) / _truncated_moment(_CUT)
+        kept = visible & (squared <= _CUT**2 * variance[:, None, None])
+        kept = kept & (kept.sum(1, keepdim=True) >= 2)
+        freedom = (2 * kept.sum(1) - 3).clamp_min(0).sum(1).to(squared)
+        variance = squared.where(kept, 0.0).sum((1, 2)) / freedom.clamp_min(1) / _truncated_moment(_CUT)
         variance = _draw_together(variance.clamp_min(_MIN_SIGMA_PX**2), freedom)
     return variance.sqrt()
 
 
 def estimate_acceleration_m(measurements: Measurements, points: Tensor, point_covariance: Tensor) -> Tensor:
-    """Standard deviation of a second difference along each axis, (P,), metres, of each point's true motion.
+    """Standard deviation of a second difference along each axis, (B, P), metres, of each point's true motion.
 
     What the measured second differences have beyond the noise of triangulation; never less than a small share of that
     noise, below which a motion cannot be told from none.
 
     Args:
-        measurements: the session.
-        points: (3, N).
-        point_covariance: mean variance along the axes of each point as triangulated, (N,), square metres.
+        measurements: the sessions.
+        points: (B, 3, N).
+        point_covariance: mean variance along the axes of each point as triangulated, (B, N), square metres.
     """
     complete = complete_triples(measurements.by_frame(measurements.active))
     x, noise = measurements.by_frame(points), measurements.by_frame(point_covariance)
-    measured = stencil(x, dim=1).square().mean(0)
-    expected = noise[2:] + 4 * noise[1:-1] + noise[:-2]
+    measured = stencil(x, dim=-2).square().mean(1)
+    expected = noise[:, 2:] + 4 * noise[:, 1:-1] + noise[:, :-2]
     weights = complete / expected.clamp_min(_MIN_ACCELERATION_M**2)
-    total = weights.sum(0).clamp_min(1e-300)
-    variance = ((measured - expected) * weights).sum(0) / total
-    discernible = _DISCERNIBLE_SHARE * complete.sum(0) / total
+    total = weights.sum(1).clamp_min(1e-300)
+    variance = ((measured - expected) * weights).sum(1) / total
+    discernible = _DISCERNIBLE_SHARE * complete.sum(1) / total
     return torch.maximum(variance, discernible).clamp_min(_MIN_ACCELERATION_M**2).sqrt()
 
 
 def _first_guess(squared: Tensor, visible: Tensor) -> Tensor:
-    """Variance (P,) by the median of the squared residuals, each enlarged by the share its point has absorbed."""
-    views = visible.sum(0)
-    enlarged = squared * (2 * views / (2 * views - 3).clamp_min(1))
-    median = enlarged.where(visible, torch.nan).flatten(0, 1).nanmedian(0).values
-    overall = enlarged[visible].median() if visible.any() else squared.new_ones(())
-    return (median.where(median.isfinite(), overall) / _MEDIAN_CHI2_2).clamp_min(_MIN_SIGMA_PX**2)
+    """Variance (B, P) by the median of the squared residuals, each enlarged by the share its point has absorbed."""
+    views = visible.sum(1, keepdim=True)
+    enlarged = (squared * (2 * views / (2 * views - 3).clamp_min(1))).where(visible, torch.nan)
+    median = enlarged.flatten(1, 2).nanmedian(1).values
+    if not bool(median.isfinite().all()):
+        overall = enlarged.flatten(1).nanmedian(1, keepdim=True).values.nan_to_num(nan=1.0)
+        median = median.where(median.isfinite(), overall)
+    return (median / _MEDIAN_CHI2_2).clamp_min(_MIN_SIGMA_PX**2)
 
 
 def _truncated_moment(cut: float) -> float:
@@ -83,12 +84,15 @@ def _truncated_moment(cut: float) -> float:
 
 
 def _draw_together(variance: Tensor, freedom: Tensor) -> Tensor:
-    """Shrink log variances (P,) with given degrees of freedom (P,) towards their mean."""
+    """Shrink log variances (B, P) with given degrees of freedom (B, P) towards the mean of their session."""
     chance = 2 / freedom.clamp_min(0.1)
     logs = variance.log()
     weights = chance.reciprocal() * (freedom > 0)
-    mean = (logs * weights).sum() / weights.sum().clamp_min(1e-300)
-    excess = (weights * ((logs - mean).square() - chance)).sum() / weights.sum().clamp_min(1e-300)
-    spread = excess.clamp_min(0.0)
-    mean = (logs / (spread + chance)).sum() / (1 / (spread + chance)).sum()
+    mean = _weighted_mean(logs, weights)
+    spread = _weighted_mean((logs - mean).square() - chance, weights).clamp_min(0.0)
+    mean = _weighted_mean(logs, 1 / (spread + chance))
     return (mean + (logs - mean) * spread / (spread + chance)).exp()
+
+
+def _weighted_mean(values: Tensor, weights: Tensor) -> Tensor:
+    return (values * weights).sum(1, keepdim=True) / weights.sum(1, keepdim=True).clamp_min(1e-300)

@@ -1,4 +1,4 @@
-"""The objective: the losses of a stage, bound to one session.
+"""The objective: the losses of a stage, bound to one batch of sessions.
 
 It can be asked for its value in two ways that the tests hold equal: as scalars through autograd, for LBFGS and training
 loops, and linearised block by block, for the Gauss-Newton solver.
@@ -7,43 +7,37 @@ loops, and linearised block by block, for the Gauss-Newton solver.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from typing import TypeVar
 
 import torch
 from torch import Tensor
 
 from torchstickcal.losses import CameraPointLoss, Loss, PairLoss, TrackLoss
 from torchstickcal.losses.base import CameraPointTerms, PairTerms, TrackTerms
-from torchstickcal.problem import Measurements, State
+from torchstickcal.problem import Columns, Measurements, State
 
-
-@dataclass(frozen=True)
-class _BoundLoss:
-    """A camera-point loss with its information matrix (C, N) on one session."""
-
-    loss: CameraPointLoss
-    information: Tensor
+_Kind = TypeVar("_Kind", bound=Loss)
 
 
 class Objective:
-    """The weighted sum of named losses over one session.
+    """The weighted sum of named losses over a batch of sessions.
 
     Args:
-        measurements: the session.
+        measurements: the sessions.
         losses: the losses by name; their weights and standard deviations are their own.
     """
 
     def __init__(self, measurements: Measurements, losses: Mapping[str, Loss]) -> None:
         self.measurements = measurements
         self.losses = dict(losses)
-        confidence = measurements.by_frame(measurements.confidence)
-        self._camera_point = {
-            name: _BoundLoss(loss, (confidence * loss.information(confidence)).flatten(1))
-            for name, loss in losses.items()
-            if isinstance(loss, CameraPointLoss)
-        }
-        self._pair = {k: v for k, v in losses.items() if isinstance(v, PairLoss) and len(measurements.pairs)}
-        self._track = {k: v for k, v in losses.items() if isinstance(v, TrackLoss) and measurements.frames > 2}
+        self._camera_point = self._of_kind(CameraPointLoss)
+        self._pair = self._of_kind(PairLoss) if len(measurements.pairs) else {}
+        self._track = self._of_kind(TrackLoss) if measurements.frames > 2 else {}
+        self._information = {name: self._by_column(loss) for name, loss in self._camera_point.items()}
+
+    def __getitem__(self, sessions: slice) -> Objective:
+        """The objective of some of the sessions."""
+        return Objective(self.measurements[sessions], {name: loss.of(sessions) for name, loss in self.losses.items()})
 
     @property
     def couples_frames(self) -> bool:
@@ -51,30 +45,37 @@ class Objective:
         return bool(self._track)
 
     def terms(self, rotations: Tensor, translations: Tensor, points: Tensor) -> dict[str, Tensor]:
-        """The value of every loss, differentiable, at cameras (C, 3, 3), (C, 3) and points (F, P, 3)."""
+        """The value of every loss, summed over the sessions, differentiable.
+
+        Args:
+            rotations: (B, C, 3, 3).
+            translations: (B, C, 3).
+            points: (B, F, P, 3).
+        """
         m = self.measurements
         confidence = m.by_frame(m.confidence)
-        keypoints = m.by_frame(m.pixels).movedim(1, -1).where(confidence[..., None] > 0, torch.nan)
+        keypoints = m.by_frame(m.pixels).movedim(2, -1).where(confidence[..., None] > 0, torch.nan)
         points = points.where(m.by_frame(m.active)[..., None], torch.nan)
         starts, ends = m.pairs.unbind(1)
         values: dict[str, Tensor] = {}
-        for name, bound in self._camera_point.items():
-            values[name] = bound.loss(points, rotations, translations, keypoints, m.cameras, confidence)
+        for name, loss in self._camera_point.items():
+            values[name] = loss(points, rotations, translations, keypoints, m.cameras, confidence)
         for name, loss in self._pair.items():
-            values[name] = loss(points[:, starts], points[:, ends], m.lengths_m)
+            values[name] = loss(points[..., starts, :], points[..., ends, :], m.lengths_m[:, None])
         for name, loss in self._track.items():
             values[name] = loss(points)
         return values
 
-    def linearise_chunk(self, state: State, columns: slice) -> dict[str, CameraPointTerms]:
-        """The camera-point losses, linearised at a slice of the columns N."""
+    def linearise_chunk(self, state: State, columns: Columns) -> dict[str, CameraPointTerms]:
+        """The camera-point losses, linearised at some of the columns N."""
         m = self.measurements
-        points_cam = state.in_cameras(columns)
+        pixels, confidence = m.pixels[..., columns], m.confidence[..., columns]
+        points_cam, rotations = state.in_cameras(columns, pixels.dtype), state.rotations.to(pixels.dtype)
         return {
-            name: bound.loss.linearise(
-                points_cam, state.rotations, m.pixels[:, :, columns], bound.information[:, columns], m.cameras
+            name: loss.linearise(
+                points_cam, rotations, pixels, confidence * self._information[name][..., columns], m.cameras_in_dtype
             )
-            for name, bound in self._camera_point.items()
+            for name, loss in self._camera_point.items()
         }
 
     def linearise_pairs(self, state: State) -> dict[str, PairTerms]:
@@ -84,7 +85,7 @@ class Objective:
         m = self.measurements
         ends = m.by_frame(state.points)[..., m.pairs]
         difference = ends[..., 1] - ends[..., 0]
-        return {name: loss.linearise(difference, m.lengths_m, m.pair_active) for name, loss in self._pair.items()}
+        return {name: loss.linearise(difference, m.lengths_m[:, None], m.pair_active) for name, loss in self._pair.items()}
 
     def linearise_tracks(self, state: State) -> dict[str, TrackTerms]:
         """The track losses, linearised."""
@@ -93,3 +94,13 @@ class Objective:
         m = self.measurements
         active = m.by_frame(m.active)
         return {name: loss.linearise(m.by_frame(state.points), active) for name, loss in self._track.items()}
+
+    def _of_kind(self, kind: type[_Kind]) -> dict[str, _Kind]:
+        return {name: loss for name, loss in self.losses.items() if isinstance(loss, kind)}
+
+    def _by_column(self, loss: Loss) -> Tensor:
+        """1 / sigma^2 of a loss (1 | B, 1, N) at every column."""
+        m = self.measurements
+        information = loss.information(m.confidence)
+        shape = (*information.shape[:1], 1) if information.ndim == 4 else (1, 1)
+        return information.reshape(*shape, 1, -1).expand(*shape, m.frames, m.points_per_frame).flatten(2)

@@ -14,7 +14,7 @@ from torchstickcal.observations import Observations
 from torchstickcal.problem import Measurements
 from torchstickcal.result import Calibration
 from torchstickcal.solvers import IterationRecord
-from torchstickcal.stages import StageResult, rulers, run_stage
+from torchstickcal.stages import StageRecord, StageResult, rulers, run_stage
 
 
 class Callback(Protocol):
@@ -51,22 +51,25 @@ def calibrate(
     """
     began = time.perf_counter()
     settings = load_config(config)
-    known = rulers(observations, settings)
+    known = rulers([observations], settings)
     measurements = Measurements.of(observations, _points_used(observations, settings))
     labels = [observations.camera_label(index) for index in range(observations.num_cameras)]
 
     state = initialise(measurements, settings.initialise, labels)
     seconds = {"initialise": time.perf_counter() - began}
 
-    stages: list[StageResult] = []
+    reached: StageResult | None = None
+    records: list[StageRecord] = []
     listener = callback.on_iteration if callback else _ignore
     for name, stage in settings.stages.items():
-        stages.append(run_stage(name, stage, measurements, state, known, settings.solver, listener))
-        state = stages[-1].state
-        seconds[name] = stages[-1].record.seconds
+        reached = run_stage(name, stage, measurements, state, known, settings.solver, listener)
+        state = reached.state
+        records += reached.records
+        seconds[name] = records[-1].seconds
+    assert reached is not None
     seconds["total"] = time.perf_counter() - began
 
-    calibration = assemble(observations, measurements, stages, seconds)
+    calibration = assemble(observations, measurements, reached, records, seconds)
     if callback:
         callback.on_end(calibration)
     return calibration

@@ -1,13 +1,14 @@
-"""One session in the solvers' layout: float64, coordinates first, points of all frames side by side.
+"""Sessions in the solvers' layout: coordinates before points, points of all frames side by side.
 
-Everything a solver touches in its inner loop is a tensor (C, k, N) or (k, N), N = F P with the frame varying slowest, so
-that a slice of frames is a contiguous slice of columns.
+Everything a solver touches in its inner loop is a tensor (B, C, k, N), (B, k, N) or (B, N): B sessions of equal shape, C
+cameras, N = F P columns with the frame varying slowest, so that a slice of frames is a contiguous slice of columns. One session
+is a batch of one.
 """
 
 from __future__ import annotations
 
-from collections.abc import Collection
-from dataclasses import dataclass, replace
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass, fields, replace
 from functools import cached_property
 
 import torch
@@ -17,8 +18,12 @@ from torchstickcal import se3
 from torchstickcal.cameras import Intrinsics
 from torchstickcal.observations import Observations
 
-_CHUNK_KEYPOINTS = 10900
-"""Keypoints worked on at a time: three numbers of each stay below the size at which torch starts threads."""
+_CHUNK_KEYPOINTS = {"one thread": 32_000, "threads": 10_900, "accelerator": 1_000_000}
+"""Keypoints worked on at a time. What is worked on stays in the cache of a core; where torch has several threads, three numbers
+of each keypoint are too few for it to start them; on an accelerator an operation should be worth its launch."""
+
+Columns = slice | Tensor
+"""Some of the columns N: a slice of whole frames, or indices."""
 
 
 @dataclass(frozen=True)
@@ -26,12 +31,12 @@ class Measurements:
     """What is known: pixels, weights, cameras and sticks.
 
     Args:
-        pixels: (C, 2, N), zero where not seen.
-        confidence: (C, N), zero where not seen and at points fewer than two cameras see.
-        cameras: intrinsics of the C cameras.
+        pixels: (B, C, 2, N), zero where not seen.
+        confidence: (B, C, N), zero where not seen and at points fewer than two cameras see.
+        cameras: intrinsics of the B sessions' C cameras.
         frames: F.
         pairs: (S, 2), the points that are ends of one stick.
-        lengths_m: (S,), the sticks' lengths.
+        lengths_m: (B, S), the sticks' lengths.
     """
 
     pixels: Tensor
@@ -42,76 +47,131 @@ class Measurements:
     lengths_m: Tensor
 
     @staticmethod
-    def of(observations: Observations, use: Collection[int] | None = None) -> Measurements:
-        """The measurements of observations; ``use`` restricts them to some of the points."""
-        keypoints = observations.keypoints.double()
+    def of(observations: Observations, use: Collection[int] | None = None, dtype: torch.dtype = torch.float64) -> Measurements:
+        """The measurements of one session.
+
+        Args:
+            observations: the session.
+            use: the points that take part; None for all.
+            dtype: of everything that there is one of per keypoint.
+        """
         visible = observations.visible
         if use is not None:
             kept = torch.zeros(observations.num_points, dtype=torch.bool, device=visible.device)
             kept[list(use)] = True
             visible = visible & kept
         visible = visible & (visible.sum(0) >= 2)
-        confidence = visible.double() if observations.confidence is None else observations.confidence.double()
+        keypoints = observations.keypoints.to(dtype)
+        confidence = visible.to(dtype) if observations.confidence is None else observations.confidence.to(dtype)
         sticks = [s for s in observations.sticks if use is None or {s.start, s.end} <= set(use)]
         return Measurements(
-            pixels=torch.where(visible[..., None], keypoints, 0.0).movedim(-1, 1).flatten(2).contiguous(),
-            confidence=torch.where(visible, confidence, 0.0).flatten(1),
-            cameras=observations.cameras,
+            pixels=torch.where(visible[..., None], keypoints, 0.0).movedim(-1, 1).flatten(2).contiguous()[None],
+            confidence=torch.where(visible, confidence, 0.0).flatten(1)[None],
+            cameras=observations.cameras.batched(),
             frames=observations.num_frames,
             pairs=torch.tensor([(s.start, s.end) for s in sticks], dtype=torch.long).view(-1, 2).to(keypoints.device),
-            lengths_m=torch.tensor([s.length_m for s in sticks], dtype=torch.float64).to(keypoints.device),
+            lengths_m=torch.tensor([[s.length_m for s in sticks]], dtype=torch.float64).to(keypoints.device),
+        )
+
+    @staticmethod
+    def stack(sessions: Sequence[Measurements]) -> Measurements:
+        """Sessions of equal shape and with the same sticks as one batch."""
+        if len(sessions) == 1:
+            return sessions[0]
+        first = sessions[0]
+        lenses = [session.cameras.distortion for session in sessions]
+        cameras = Intrinsics(
+            torch.cat([session.cameras.matrix for session in sessions]),
+            None if lenses[0] is None else torch.cat([lens for lens in lenses if lens is not None]),
+            first.cameras.fisheye,
+        )
+        pixels, confidence, lengths_m = (
+            torch.cat([getattr(session, name) for session in sessions]) for name in ("pixels", "confidence", "lengths_m")
+        )
+        return Measurements(pixels, confidence, cameras, first.frames, first.pairs, lengths_m)
+
+    def __getitem__(self, sessions: slice) -> Measurements:
+        """Some of the sessions."""
+        return replace(
+            self,
+            pixels=self.pixels[sessions],
+            confidence=self.confidence[sessions],
+            cameras=self.cameras[sessions],
+            lengths_m=self.lengths_m[sessions],
         )
 
     def keeping(self, kept: Tensor) -> Measurements:
-        """The measurements without the keypoints outside a mask (C, N), and without points left with a single view."""
+        """The measurements without the keypoints outside a mask (B, C, N), and without points left with a single view."""
         confidence = self.confidence * kept
-        return replace(self, confidence=confidence * ((confidence > 0).sum(0) >= 2))
+        return replace(self, confidence=confidence.mul_((confidence > 0).sum(-2, keepdim=True) >= 2))
 
     def squared_residuals(self, state: State) -> Tensor:
-        """Squared distances (C, N) between projections and keypoints, square pixels, times the keypoint's confidence.
+        """Squared distances (B, C, N) between projections and keypoints, square pixels, times the keypoint's confidence.
 
         Infinite where a keypoint is not seen or its point lies behind the camera.
         """
         squared = torch.empty_like(self.confidence)
         for columns in self.chunks():
-            x, y, z = state.in_cameras(columns).unbind(1)
-            px, py = self.cameras.project_components(x, y, z)
-            distance = (px - self.pixels[:, 0, columns]).square() + (py - self.pixels[:, 1, columns]).square()
-            confidence = self.confidence[:, columns]
-            squared[:, columns] = (distance * confidence).where((confidence > 0) & (z > 0), torch.inf)
+            x, y, z = state.in_cameras(columns, squared.dtype).unbind(-2)
+            px, py = self.cameras_in_dtype.project_components(x, y, z)
+            u, v = self.pixels[..., columns].unbind(-2)
+            confidence = self.confidence[..., columns]
+            distance = ((px - u).square() + (py - v).square()) * confidence
+            squared[..., columns] = distance.where((confidence > 0) & (z > 0), torch.inf)
         return squared
 
     @cached_property
+    def cameras_in_dtype(self) -> Intrinsics:
+        """The cameras in the dtype of the pixels."""
+        return self.cameras.to(self.pixels.dtype)
+
+    @cached_property
     def visible(self) -> Tensor:
-        """(C, N), True where a keypoint counts."""
+        """(B, C, N), True where a keypoint counts."""
         return self.confidence > 0
 
     @cached_property
     def active(self) -> Tensor:
-        """(N,), True where two cameras or more see the point."""
-        return self.visible.any(0)
-
-    @cached_property
-    def inactive_columns(self) -> Tensor:
-        """Indices (K,) of the columns that are not active."""
-        return (~self.active).nonzero()[:, 0]
+        """(B, N), True where two cameras or more see the point."""
+        return self.visible.any(-2)
 
     @cached_property
     def pair_active(self) -> Tensor:
-        """(F, S), True where both ends of a stick are active."""
-        return self.by_frame(self.active)[:, self.pairs].all(-1)
+        """(B, F, S), True where both ends of a stick are active."""
+        return self.by_frame(self.active)[..., self.pairs].all(-1)
+
+    @property
+    def sessions(self) -> int:
+        """B"""
+        return self.confidence.shape[0]
+
+    @property
+    def num_cameras(self) -> int:
+        """C"""
+        return self.confidence.shape[1]
+
+    @property
+    def num_columns(self) -> int:
+        """N"""
+        return self.confidence.shape[2]
 
     @property
     def points_per_frame(self) -> int:
         """P"""
-        return self.confidence.shape[1] // self.frames
+        return self.num_columns // self.frames
 
-    def chunks(self, columns: slice = slice(None)) -> list[slice]:
-        """Slices of some of the columns, whole frames each, small enough for the arrays of one to stay in the cache."""
-        cameras, total = self.confidence.shape
-        first, last = columns.start or 0, total if columns.stop is None else columns.stop
-        width = self.points_per_frame * max(1, _CHUNK_KEYPOINTS // (self.points_per_frame * cameras))
-        return [slice(start, min(start + width, last)) for start in range(first, last, width)]
+    def chunks(self) -> list[slice]:
+        """Slices of the columns, whole frames each, small enough to be worked on at a time."""
+        keypoints_per_frame = self.sessions * self.num_cameras * self.points_per_frame
+        width = self.points_per_frame * max(1, self.chunk_keypoints // keypoints_per_frame)
+        return [slice(start, min(start + width, self.num_columns)) for start in range(0, self.num_columns, width)]
+
+    @property
+    def chunk_keypoints(self) -> int:
+        """Keypoints worked on at a time."""
+        if self.pixels.device.type != "cpu":
+            return _CHUNK_KEYPOINTS["accelerator"]
+        return _CHUNK_KEYPOINTS["one thread" if torch.get_num_threads() == 1 else "threads"]
 
     def frame_slices(self) -> list[slice]:
         """The frames of each of :meth:`chunks`."""
@@ -119,9 +179,9 @@ class Measurements:
         return [slice(columns.start // points, columns.stop // points) for columns in self.chunks()]
 
     def stick_lengths_m(self, points: Tensor) -> Tensor:
-        """Lengths (F, S) of the sticks among points (3, N); NaN in frames where an end is not active."""
+        """Lengths (B, F, S) of the sticks among points (B, 3, N); NaN in frames where an end is not active."""
         ends = self.by_frame(points)[..., self.pairs]
-        return (ends[..., 1] - ends[..., 0]).square().sum(0).sqrt().where(self.pair_active, torch.nan)
+        return (ends[..., 1] - ends[..., 0]).square().sum(1).sqrt().where(self.pair_active, torch.nan)
 
     def by_frame(self, columns: Tensor) -> Tensor:
         """A tensor (..., N) as (..., F, P)."""
@@ -130,24 +190,43 @@ class Measurements:
 
 @dataclass(frozen=True)
 class State:
-    """The unknowns: rotations (C, 3, 3) and translations (C, 3) world to camera, points (3, N) in metres."""
+    """The unknowns: rotations (B, C, 3, 3) and translations (B, C, 3) world to camera, points (B, 3, N), metres; float64."""
 
     rotations: Tensor
     translations: Tensor
     points: Tensor
 
-    def scaled(self, factor: float) -> State:
-        """The same scene, ``factor`` times as large."""
+    @staticmethod
+    def stack(states: Sequence[State]) -> State:
+        """The states of several sessions as those of one batch."""
+        return State(*(torch.cat([getattr(state, field.name) for state in states]) for field in fields(State)))
+
+    def __getitem__(self, sessions: slice) -> State:
+        """Those of some of the sessions."""
+        return State(self.rotations[sessions], self.translations[sessions], self.points[sessions])
+
+    def replaced(self, where: Tensor, other: State) -> State:
+        """The state with some sessions (B,), True where, taken from another."""
+        return State(
+            torch.where(where[:, None, None, None], other.rotations, self.rotations),
+            torch.where(where[:, None, None], other.translations, self.translations),
+            torch.where(where[:, None, None], other.points, self.points),
+        )
+
+    def scaled(self, factors: Tensor) -> State:
+        """The same scenes, each its factor (B,) times as large."""
+        factor = factors[:, None, None]
         return replace(self, translations=self.translations * factor, points=self.points * factor)
 
     def retracted(self, camera_step: Tensor, point_step: Tensor) -> State:
-        """The state after tangent steps (C - 1, 6) of all cameras but the first, or (0, 6), and steps (3, N) of the points."""
+        """The state after tangent steps (B, C - 1, 6) of all cameras but the first, or (B, 0, 6), and steps (B, 3, N)."""
         rotations, translations = self.rotations, self.translations
-        if len(camera_step):
-            moved = se3.retract(rotations[1:], translations[1:], camera_step)
-            rotations, translations = torch.cat([rotations[:1], moved[0]]), torch.cat([translations[:1], moved[1]])
+        if camera_step.shape[1]:
+            moved = se3.retract(rotations[:, 1:], translations[:, 1:], camera_step)
+            rotations = torch.cat([rotations[:, :1], moved[0]], dim=1)
+            translations = torch.cat([translations[:, :1], moved[1]], dim=1)
         return State(rotations, translations, self.points + point_step)
 
-    def in_cameras(self, columns: slice = slice(None)) -> Tensor:
-        """The points in every camera's frame, (C, 3, N)."""
-        return self.rotations @ self.points[:, columns] + self.translations[..., None]
+    def in_cameras(self, columns: Columns = slice(None), dtype: torch.dtype = torch.float64) -> Tensor:
+        """The points in every camera's frame, (B, C, 3, N), computed in float64 and then rounded."""
+        return se3.moved(self.rotations, self.translations, self.points[..., columns]).to(dtype)

@@ -40,6 +40,12 @@ def exp(tangents: Tensor) -> tuple[Tensor, Tensor]:
     return identity + a * skew + b * skew_squared, (left_jacobian @ translation[..., None])[..., 0]
 
 
+def moved(rotations: Tensor, translations: Tensor, points: Tensor) -> Tensor:
+    """``R X + t`` (B, C, 3, N) of points (B, 3, N) under C transforms (B, C, 3, 3), (B, C, 3)."""
+    stacked = torch.baddbmm(translations.flatten(1)[..., None], rotations.flatten(1, 2), points)
+    return stacked.unflatten(1, (-1, 3))
+
+
 def retract(rotations: Tensor, translations: Tensor, tangents: Tensor) -> tuple[Tensor, Tensor]:
     """``T Exp(tangent)`` for transforms given as rotations (..., 3, 3) and translations (..., 3)."""
     step_rotation, step_translation = exp(tangents)

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
+import torch
 from torch import Tensor
 
 from torchstickcal.config import Config, Stage
@@ -17,7 +18,7 @@ from torchstickcal.objective import Objective
 from torchstickcal.observations import Observations
 from torchstickcal.problem import Measurements, State
 from torchstickcal.solvers import IterationRecord, Listener, Stop, Termination, solver
-from torchstickcal.solvers.normal_equations import linearise
+from torchstickcal.solvers.normal_equations import NormalEquations
 
 _OUTLIER_CUT = 3.5
 _MAD_TO_SIGMA = 1.4826
@@ -42,30 +43,35 @@ class Ruler:
 
     start: tuple[int, ...]
     end: tuple[int, ...]
-    length_m: float
+    lengths_m: tuple[float, ...]
+    """one for each session"""
     rigid: bool
 
-    def lengths_m(self, measurements: Measurements, points: Tensor) -> Tensor:
-        """Its length in the frames (K,) in which all its points are known, of points (3, N)."""
+    def measured_m(self, measurements: Measurements, points: Tensor) -> Tensor:
+        """Its length in every frame (B, F), NaN where not all its points are known, of points (B, 3, N)."""
         by_frame, active = measurements.by_frame(points), measurements.by_frame(measurements.active)
         start, end = list(self.start), list(self.end)
-        known = active[:, start + end].all(1)
-        vectors = by_frame[:, known][..., end].mean(-1) - by_frame[:, known][..., start].mean(-1)
-        return vectors.square().sum(0).sqrt()
+        vectors = by_frame[..., end].mean(-1) - by_frame[..., start].mean(-1)
+        return vectors.square().sum(1).sqrt().where(active[..., start + end].all(-1), torch.nan)
 
 
-def rulers(observations: Observations, config: Config) -> list[Ruler]:
-    """Where the scale comes from: the configuration's segment, else the sticks.
+def rulers(sessions: Sequence[Observations], config: Config) -> list[Ruler]:
+    """Where the scale comes from: the configuration's segment, else the sticks, of sessions with the same points and sticks.
 
     Raises:
         ConfigError: if there is neither.
         ObservationError: if the segment names a point the session does not have.
     """
+    observations = sessions[0]
     if config.scale is not None:
         start, end = (tuple(map(observations.point_index, names)) for names in (config.scale.start, config.scale.end))
-        return [Ruler(start, end, config.scale.length_m, rigid=False)]
+        return [Ruler(start, end, (config.scale.length_m,) * len(sessions), rigid=False)]
     if observations.sticks and config.points != "joints":
-        return [Ruler((stick.start,), (stick.end,), stick.length_m, rigid=True) for stick in observations.sticks]
+        lengths_m = zip(*([stick.length_m for stick in session.sticks] for session in sessions), strict=True)
+        return [
+            Ruler((stick.start,), (stick.end,), lengths, rigid=True)
+            for stick, lengths in zip(observations.sticks, lengths_m, strict=True)
+        ]
     raise ConfigError(
         "nothing sets the scale",
         where="scale",
@@ -74,21 +80,23 @@ def rulers(observations: Observations, config: Config) -> list[Ruler]:
     )
 
 
-def scale_factor(measurements: Measurements, points: Tensor, known: Sequence[Ruler]) -> float:
-    """The paper's stage 2: known over mean reconstructed length; a rigid ruler's outlying frames are left out.
+def scale_factors(measurements: Measurements, points: Tensor, known: Sequence[Ruler]) -> Tensor:
+    """The paper's stage 2: known over mean reconstructed length, (B,); a rigid ruler's outlying frames are left out.
 
     Raises:
-        ObservationError: if there is no frame in which a ruler's points are all known.
+        ObservationError: if there is no frame of some session in which a ruler's points are all known.
     """
-    measured, expected = 0.0, 0.0
+    measured, expected = points.new_zeros(measurements.sessions), points.new_zeros(measurements.sessions)
     for ruler in known:
-        lengths = ruler.lengths_m(measurements, points)
+        lengths = ruler.measured_m(measurements, points)
         if ruler.rigid:
-            deviation = (lengths - lengths.median()).abs()
-            lengths = lengths[deviation <= _OUTLIER_CUT * _MAD_TO_SIGMA * deviation.median() + 1e-12 * lengths.median()]
-        measured += float(lengths.sum())
-        expected += ruler.length_m * len(lengths)
-    if not measured:
+            median = lengths.nanmedian(1, keepdim=True).values
+            deviation = (lengths - median).abs()
+            limit = _OUTLIER_CUT * _MAD_TO_SIGMA * deviation.nanmedian(1, keepdim=True).values + 1e-12 * median
+            lengths = lengths.where(deviation <= limit, torch.nan)
+        measured += lengths.nansum(1)
+        expected += points.new_tensor(ruler.lengths_m) * lengths.isfinite().sum(1)
+    if not bool((measured > 0).all()):
         raise ObservationError(
             "the length that sets the scale is never seen whole",
             where="scale",
@@ -99,12 +107,15 @@ def scale_factor(measurements: Measurements, points: Tensor, known: Sequence[Rul
 
 
 class StageResult(NamedTuple):
-    """Where a stage ended: the state, the measurements that took part, their noise (P,) before it, and its record."""
+    """Where a stage ended: the state, which keypoints took part, their noise before it, and its records."""
 
     state: State
-    measurements: Measurements
+    inliers: Tensor
+    """(B, C, N)"""
     sigma_px: Tensor
-    record: StageRecord
+    """(B, P)"""
+    records: tuple[StageRecord, ...]
+    """one for each session"""
 
 
 def run_stage(
@@ -116,13 +127,15 @@ def run_stage(
     solver_name: str,
     listener: Listener,
 ) -> StageResult:
-    """Run one stage from a state."""
+    """Run one stage from a state, for all sessions."""
     began = time.perf_counter()
     squared_residuals = measurements.squared_residuals(state)
     sigma_px = estimate_sigma_px(measurements, squared_residuals)
     if stage.reject_sigmas is not None:
-        agreeing = measurements.by_frame(squared_residuals) <= (stage.reject_sigmas * sigma_px).square()
-        measurements = measurements.keeping(agreeing.flatten(1))
+        limits = (stage.reject_sigmas * sigma_px).square().to(squared_residuals)
+        agreeing = measurements.by_frame(squared_residuals) <= limits[:, None, None]
+        measurements = measurements.keeping(agreeing.flatten(2))
+    del squared_residuals
     objective = Objective(measurements, _losses(stage, measurements, state, sigma_px))
     outcome = solver(solver_name)(
         objective,
@@ -134,15 +147,17 @@ def run_stage(
     )
     state = outcome.state
     if stage.rescale:
-        state = state.scaled(scale_factor(measurements, state.points, known))
-    record = StageRecord(name, outcome.stop, time.perf_counter() - began, outcome.iterations)
-    return StageResult(state, measurements, sigma_px, record)
+        state = state.scaled(scale_factors(measurements, state.points, known))
+    seconds = time.perf_counter() - began
+    ended = zip(outcome.stops, outcome.iterations, strict=True)
+    records = tuple(StageRecord(name, stop, seconds, iterations) for stop, iterations in ended)
+    return StageResult(state, measurements.visible, sigma_px, records)
 
 
 def _losses(stage: Stage, measurements: Measurements, state: State, sigma_px: Tensor) -> dict[str, Loss]:
     settings = stage.reprojection
     reprojection = ReprojectionLoss(
-        sigma_px if settings.sigma_px == "estimated" else settings.sigma_px,
+        sigma_px[:, None, None] if settings.sigma_px == "estimated" else settings.sigma_px,
         settings.weight,
         robust_kernel(settings.kernel, settings.kernel_scale),
     )
@@ -152,7 +167,7 @@ def _losses(stage: Stage, measurements: Measurements, state: State, sigma_px: Te
     if stage.smoothness is not None:
         sigma_m = stage.smoothness.sigma_m
         if sigma_m == "estimated":
-            system = linearise(Objective(measurements, dict(losses)), state, cameras_free=False)
-            sigma_m = estimate_acceleration_m(measurements, state.points, system.point_variance())
+            system = NormalEquations(Objective(measurements, losses), state, cameras_free=False)
+            sigma_m = estimate_acceleration_m(measurements, state.points, system.point_variance())[:, None]
         losses["smoothness"] = SmoothnessLoss(sigma_m, stage.smoothness.weight)
     return losses

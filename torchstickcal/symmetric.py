@@ -1,7 +1,7 @@
-"""Symmetric 3 x 3 matrices, many at once, coordinates first.
+"""Symmetric 3 x 3 matrices, many at once, coordinates before their number.
 
-A matrix is stored as its six distinct entries xx xy xz yy yz zz, a (6, N) tensor for N of them, and every operation runs over
-all N entry by entry.
+A matrix is stored as its six distinct entries xx xy xz yy yz zz, a (..., 6, N) tensor for N of them, and every operation runs
+over all N entry by entry.
 """
 
 from __future__ import annotations
@@ -15,58 +15,75 @@ DIAGONAL = [0, 3, 5]
 IDENTITY = (1.0, 0.0, 0.0, 1.0, 0.0, 1.0)
 """The entries of the identity."""
 
-_RELATIVE_PIVOT_FLOOR = 1e-13
+_ENTRIES = [0, 1, 2, 1, 3, 4, 2, 4, 5]
+_RELATIVE_PIVOT_FLOOR = {torch.float64: 1e-13, torch.float32: 1e-6}
 
 
 def expand(entries: Tensor) -> Tensor:
-    """Symmetric matrices (3, 3, ...) of their six distinct entries (6, ...)."""
-    xx, xy, xz, yy, yz, zz = entries
-    return torch.stack([xx, xy, xz, xy, yy, yz, xz, yz, zz]).unflatten(0, (3, 3))
+    """Symmetric matrices (..., 3, 3, N) of their six distinct entries (..., 6, N)."""
+    return entries[..., _ENTRIES, :].unflatten(-2, (3, 3))
 
 
 def outer(vectors: Tensor) -> Tensor:
-    """The six entries (6, ...) of v v^T for vectors (3, ...)."""
-    x, y, z = vectors
-    return torch.stack([x * x, x * y, x * z, y * y, y * z, z * z])
+    """The six entries (..., 6, N) of v v^T for vectors (..., 3, N)."""
+    x, y, z = vectors.unbind(-2)
+    return torch.stack([x * x, x * y, x * z, y * y, y * z, z * z], dim=-2)
 
 
 def gram(matrices: Tensor) -> Tensor:
-    """The six entries of A^T A, for matrices stored as (row, column, M)."""
-    a, b, c = matrices.unbind(1)
-    return torch.stack([(p * q).sum(0) for p, q in ((a, a), (a, b), (a, c), (b, b), (b, c), (c, c))])
+    """The six entries (..., 6, N) of A^T A, for matrices stored as (..., column, row, N)."""
+    a, b, c = matrices.unbind(-3)
+    return torch.stack([(p * q).sum(-2) for p, q in ((a, a), (a, b), (a, c), (b, b), (b, c), (c, c))], dim=-2)
+
+
+def raised(entries: Tensor, damping: Tensor | float) -> Tensor:
+    """The matrices (..., 6, N) with their diagonals multiplied by 1 + damping, a number or (...)."""
+    factor = 1 + torch.as_tensor(damping, dtype=entries.dtype, device=entries.device)
+    raised = entries.clone()
+    raised[..., DIAGONAL, :] *= factor[..., None, None]
+    return raised
 
 
 def cholesky(entries: Tensor) -> Tensor:
-    """Factors (6, N) as 1/l00 l10 l20 1/l11 l21 1/l22; pivots are kept above rounding."""
-    xx, xy, xz, yy, yz, zz = entries
+    """Factors (..., 6, N) as 1/l00 l10 l20 1/l11 l21 1/l22; pivots are kept above rounding."""
+    floor = _RELATIVE_PIVOT_FLOOR[entries.dtype]
+    xx, xy, xz, yy, yz, zz = entries.unbind(-2)
     r0 = xx.rsqrt()
     l10, l20 = xy * r0, xz * r0
-    r1 = torch.maximum(torch.addcmul(yy, l10, l10, value=-1), yy * _RELATIVE_PIVOT_FLOOR).rsqrt()
+    r1 = torch.maximum(torch.addcmul(yy, l10, l10, value=-1), yy * floor).rsqrt()
     l21 = torch.addcmul(yz, l20, l10, value=-1) * r1
     pivot = torch.addcmul(zz, l20, l20, value=-1).addcmul_(l21, l21, value=-1)
-    r2 = torch.maximum(pivot, zz * _RELATIVE_PIVOT_FLOOR).rsqrt()
-    return torch.stack([r0, l10, l20, r1, l21, r2])
+    r2 = torch.maximum(pivot, zz * floor).rsqrt()
+    return torch.stack([r0, l10, l20, r1, l21, r2], dim=-2)
 
 
 def forward(lower: Tensor, rhs: Tensor) -> Tensor:
-    """``L^-1 b`` for right-hand sides (3, ..., N)."""
-    r0, l10, l20, r1, l21, r2 = lower
-    x = rhs[0] * r0
-    y = torch.addcmul(rhs[1], l10, x, value=-1) * r1
-    z = torch.addcmul(rhs[2], l20, x, value=-1).addcmul_(l21, y, value=-1) * r2
-    return torch.stack([x, y, z])
+    """``L^-1 b`` for right-hand sides (..., 3, N)."""
+    r0, l10, l20, r1, l21, r2 = lower.unbind(-2)
+    b0, b1, b2 = rhs.unbind(-2)
+    x = b0 * r0
+    y = torch.addcmul(b1, l10, x, value=-1) * r1
+    z = torch.addcmul(b2, l20, x, value=-1).addcmul_(l21, y, value=-1) * r2
+    return torch.stack([x, y, z], dim=-2)
 
 
 def backward(lower: Tensor, rhs: Tensor) -> Tensor:
-    """``L^-T b`` for a right-hand side (3, N)."""
-    r0, l10, l20, r1, l21, r2 = lower
-    z = rhs[2] * r2
-    y = (rhs[1] - l21 * z) * r1
-    x = (rhs[0] - l10 * y - l20 * z) * r0
-    return torch.stack([x, y, z])
+    """``L^-T b`` for right-hand sides (..., 3, N)."""
+    r0, l10, l20, r1, l21, r2 = lower.unbind(-2)
+    b0, b1, b2 = rhs.unbind(-2)
+    z = b2 * r2
+    y = (b1 - l21 * z) * r1
+    x = (b0 - l10 * y - l20 * z) * r0
+    return torch.stack([x, y, z], dim=-2)
 
 
 def solve(entries: Tensor, rhs: Tensor) -> Tensor:
-    """``A^-1 b`` for positive definite matrices (6, N) and right-hand sides (3, N)."""
+    """``A^-1 b`` for positive definite matrices (..., 6, N) and right-hand sides (..., 3, N)."""
     lower = cholesky(entries)
     return backward(lower, forward(lower, rhs))
+
+
+def inverse_diagonal(entries: Tensor) -> Tensor:
+    """Diagonals (..., 3, N) of the inverses of positive definite matrices (..., 6, N)."""
+    identity = torch.eye(3, dtype=entries.dtype, device=entries.device)[..., None]
+    return forward(cholesky(entries).unsqueeze(-3), identity).square().sum(-2)

@@ -24,7 +24,7 @@ def initialise(measurements: Measurements, settings: InitialiseSettings, labels:
     """Cameras and points up to scale, in the frame of the first camera.
 
     Args:
-        measurements: the session.
+        measurements: one session.
         settings: thresholds.
         labels: the cameras' names, for messages.
 
@@ -36,10 +36,11 @@ def initialise(measurements: Measurements, settings: InitialiseSettings, labels:
     edges = spanning_tree(views.common(), find, labels, settings.min_common_points)
     scale = _SUPPORT_RADIUS * settings.threshold_px / float(measurements.cameras.focal_px.mean())
     poses = propagate(edges, views, scale)
-    rotations, translations = (torch.from_numpy(pose).to(measurements.pixels) for pose in poses)
-    points = torch.zeros_like(measurements.pixels[0, :1]).repeat(3, 1)
+    rotations, translations = (torch.from_numpy(pose).to(measurements.pixels.device) for pose in poses)
+    points = rotations.new_zeros(3, measurements.num_columns)
     for columns in measurements.chunks():
-        rays = measurements.cameras.undistort(measurements.pixels[:, :, columns].movedim(1, -1)).movedim(-1, 1)
-        weights = measurements.confidence[:, columns] * rays.isfinite().all(1)
+        pixels = measurements.pixels[0][..., columns].double().movedim(1, -1)
+        rays = measurements.cameras[0].undistort(pixels).movedim(-1, 1)
+        weights = measurements.confidence[0][:, columns].double() * rays.isfinite().all(1)
         points[:, columns] = triangulate(rotations, translations, rays.nan_to_num(), weights, scale=scale).nan_to_num()
-    return State(rotations, translations, points)
+    return State(rotations[None], translations[None], points[None])

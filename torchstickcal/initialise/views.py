@@ -17,14 +17,14 @@ class Views:
     """Access to the keypoints of a session without holding them twice.
 
     Args:
-        measurements: the session.
+        measurements: one session.
     """
 
     def __init__(self, measurements: Measurements) -> None:
         self._measurements = measurements
-        self.visible: NDArray[np.bool_] = measurements.visible.cpu().numpy()
+        self.visible: NDArray[np.bool_] = measurements.visible[0].cpu().numpy()
         """(C, N)"""
-        self.focal_px: Array = measurements.cameras.focal_px.cpu().numpy()
+        self.focal_px: Array = measurements.cameras.focal_px[0].cpu().numpy()
         """(C,)"""
         self._whole = self._undistorted(slice(None), slice(None)) if self.visible.size <= _UNDISTORTED_AT_ONCE else None
 
@@ -44,8 +44,8 @@ class Views:
 
     def _undistorted(self, cameras: list[int] | slice, columns: NDArray[np.intp] | slice) -> Array:
         m = self._measurements
-        pixels = m.pixels[cameras][:, :, columns].movedim(1, -1)
-        return m.cameras[cameras].undistort(pixels).movedim(-1, 1).cpu().numpy()
+        pixels = m.pixels[0][cameras][:, :, columns].double().movedim(1, -1)
+        return m.cameras[0][cameras].undistort(pixels).movedim(-1, 1).cpu().numpy()
 
 
 def spread(count: int, limit: int) -> NDArray[np.intp]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import zipfile
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -33,7 +34,26 @@ class Truth:
     translations: Tensor
     """(C, 3), world to camera, metres"""
     points: Tensor | None = None
-    """(F, P, 3), metres"""
+    """(F, P, 3), metres, at the frame times of camera 0"""
+    intrinsics: Tensor | None = None
+    """(C, 3, 3), where those given with the session may be wrong"""
+    distortion: Tensor | None = None
+    """(C, D), likewise"""
+    time_offsets_s: Tensor | None = None
+    """(C,): a camera's frame f begins at frame f of camera 0 plus this"""
+    readout_s: Tensor | None = None
+    """(C,), of a rolling shutter: row v of h is exposed ``readout_s * v / h`` after the frame begins"""
+
+
+_TRUTH_ARRAYS = {
+    "rotations": "rotation",
+    "translations": "translation",
+    "points": "points",
+    "intrinsics": "true_intrinsics",
+    "distortion": "true_distortion",
+    "time_offsets_s": "time_offsets_s",
+    "readout_s": "readout_s",
+}
 
 
 def read_session(path: str | Path) -> tuple[Observations, Truth | None]:
@@ -98,7 +118,8 @@ def read_npz(path: str | Path) -> tuple[Observations, Truth | None]:
 
     Arrays: ``keypoints`` (C, F, P, 2), NaN where not seen; ``intrinsics`` (C, 3, 3); ``stick_start``, ``stick_end`` and
     ``stick_length_m`` (S,); optional ``confidence`` (C, F, P), ``distortion`` (C, D), ``image_size`` (C, 2), ``names`` (P),
-    ``camera_names`` (C), ``fps``, and as truth ``rotation`` (C, 3, 3), ``translation`` (C, 3), ``points`` (F, P, 3).
+    ``camera_names`` (C), ``fps``, and as truth ``rotation`` (C, 3, 3), ``translation`` (C, 3), ``points`` (F, P, 3),
+    ``true_intrinsics`` (C, 3, 3), ``true_distortion`` (C, D), ``time_offsets_s`` (C), ``readout_s`` (C).
 
     Raises:
         FileFormatError: if an array is missing or the file is damaged.
@@ -124,16 +145,19 @@ def read_npz(path: str | Path) -> tuple[Observations, Truth | None]:
         )
         if "rotation" not in data:
             return observations, None
-        points = torch.from_numpy(data["points"]) if "points" in data else None
-        return observations, Truth(torch.from_numpy(data["rotation"]), torch.from_numpy(data["translation"]), points)
+        return observations, Truth(
+            **{name: torch.from_numpy(data[array]) for name, array in _TRUTH_ARRAYS.items() if array in data}
+        )
     except CalibrationError:
         raise
     except (KeyError, TypeError, ValueError, EOFError, zipfile.BadZipFile) as error:
         raise _not_a_session(path, error, "a session with keypoints, intrinsics and sticks") from error
 
 
-def write_npz(path: str | Path, observations: Observations, truth: Truth | None = None) -> None:
-    """Write a session as :func:`read_npz` reads it."""
+def write_npz(
+    path: str | Path, observations: Observations, truth: Truth | None = None, more: Mapping[str, Any] | None = None
+) -> None:
+    """Write a session as :func:`read_npz` reads it, with ``more`` arrays that it passes over."""
     arrays: dict[str, Any] = {
         "keypoints": observations.keypoints.cpu().numpy(),
         "intrinsics": observations.intrinsics.cpu().numpy(),
@@ -148,8 +172,9 @@ def write_npz(path: str | Path, observations: Observations, truth: Truth | None 
     optional = {"fps": observations.fps, "names": observations.point_names, "camera_names": observations.camera_names}
     arrays |= {name: np.array(value) for name, value in optional.items() if value is not None}
     if truth is not None:
-        arrays |= {"rotation": truth.rotations.numpy(), "translation": truth.translations.numpy()}
-        arrays |= {} if truth.points is None else {"points": truth.points.numpy()}
+        known = {array: getattr(truth, name) for name, array in _TRUTH_ARRAYS.items()}
+        arrays |= {array: value.numpy() for array, value in known.items() if value is not None}
+    arrays |= more or {}
     with atomic_path(path) as temporary, temporary.open("wb") as file:
         np.savez_compressed(file, **arrays)
 

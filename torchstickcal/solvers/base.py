@@ -46,6 +46,8 @@ class Termination:
 class IterationRecord:
     """One iteration of one stage."""
 
+    session: int
+    """which of the sessions solved together"""
     stage: str
     iteration: int
     cost: float
@@ -66,15 +68,17 @@ Listener = Callable[[IterationRecord], None]
 
 @dataclass(frozen=True)
 class Outcome:
-    """Where a solver ended, why, and how it got there."""
+    """Where a solver ended, why, and how it got there, for B sessions."""
 
     state: State
-    stop: Stop
-    iterations: tuple[IterationRecord, ...]
+    stops: tuple[Stop, ...]
+    """one for each session"""
+    iterations: tuple[tuple[IterationRecord, ...], ...]
+    """those of each session"""
 
 
 class Solver(Protocol):
-    """Minimises an objective from a state."""
+    """Minimises an objective from a state, each session on its own."""
 
     def __call__(
         self,

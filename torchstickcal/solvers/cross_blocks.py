@@ -11,31 +11,33 @@ from torch import Tensor
 
 
 def cross_rows(blocks: Tensor, points: Tensor) -> Tensor:
-    """``(N B(X))^T`` as (C', 6, 3, n), for blocks (C', 6, n) and points (3, n)."""
-    rows = blocks.new_empty(blocks.shape[0], 6, 3, blocks.shape[2])
-    rows[:, :3, 0] = blocks[:, :3]
-    rows[:, 0, 1], rows[:, 1:3, 1] = blocks[:, 1], blocks[:, 3:5]
-    rows[:, 0, 2], rows[:, 1:3, 2] = blocks[:, 2], blocks[:, 4:]
+    """``(N B(X))^T`` as (B, C', 6, 3, n), for blocks (B, C', 6, n) and points (B, 3, n)."""
+    rows = blocks.new_empty(*blocks.shape[:2], 6, 3, blocks.shape[-1])
+    rows[:, :, :3, 0] = blocks[:, :, :3]
+    rows[:, :, 0, 1], rows[:, :, 1:3, 1] = blocks[:, :, 1], blocks[:, :, 3:5]
+    rows[:, :, 0, 2], rows[:, :, 1:3, 2] = blocks[:, :, 2], blocks[:, :, 4:]
     add_rotations(rows, points)
     return rows
 
 
 def add_rotations(rows: Tensor, points: Tensor) -> None:
-    """Fill in the rotations' rows (C', 3:6, 3, n) of the translations' rows: columns of A, to those of ``-A [X]x``."""
-    x, y, z = points
-    torch.mul(rows[:, 2], y, out=rows[:, 3]).addcmul_(rows[:, 1], z, value=-1)
-    torch.mul(rows[:, 0], z, out=rows[:, 4]).addcmul_(rows[:, 2], x, value=-1)
-    torch.mul(rows[:, 1], x, out=rows[:, 5]).addcmul_(rows[:, 0], y, value=-1)
+    """Fill in the rotations' rows (B, C', 3:6, 3, n) of the translations' rows: columns of A, to those of ``-A [X]x``."""
+    x, y, z = points[:, None, None].unbind(-2)
+    a, b, c = rows[:, :, :3].unbind(2)
+    torch.mul(c, y, out=rows[:, :, 3]).addcmul_(b, z, value=-1)
+    torch.mul(a, z, out=rows[:, :, 4]).addcmul_(c, x, value=-1)
+    torch.mul(b, x, out=rows[:, :, 5]).addcmul_(a, y, value=-1)
 
 
 def symmetric_times(blocks: Tensor, vectors: Tensor) -> Tensor:
-    """``sum_c N_c v_c`` (3, n) for blocks (C', 6, n) and vectors (C', 3, n)."""
-    xx, xy, xz, yy, yz, zz = blocks.unbind(1)
-    x, y, z = vectors.unbind(1)
+    """``sum_c N_c v_c`` (B, 3, n) for blocks (B, C', 6, n) and vectors (B, C', 3, n)."""
+    xx, xy, xz, yy, yz, zz = blocks.unbind(2)
+    x, y, z = vectors.unbind(2)
     return torch.stack(
         [
-            (xx * x).addcmul_(xy, y).addcmul_(xz, z).sum(0),
-            (xy * x).addcmul_(yy, y).addcmul_(yz, z).sum(0),
-            (xz * x).addcmul_(yz, y).addcmul_(zz, z).sum(0),
-        ]
+            (xx * x).addcmul_(xy, y).addcmul_(xz, z).sum(1),
+            (xy * x).addcmul_(yy, y).addcmul_(yz, z).sum(1),
+            (xz * x).addcmul_(yz, y).addcmul_(zz, z).sum(1),
+        ],
+        dim=1,
     )

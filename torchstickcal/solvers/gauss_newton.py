@@ -1,15 +1,19 @@
-"""Levenberg-Marquardt on the exactly reduced system; robust kernels by iteratively re-weighted least squares."""
+"""Levenberg-Marquardt on the exactly reduced system; robust kernels by iteratively re-weighted least squares.
+
+Several sessions descend side by side: each round builds one system for all of them, each session judges its own step, chooses
+its own damping and stops for its own reason.
+"""
 
 from __future__ import annotations
 
-from typing import NamedTuple
+import math
 
 import torch
 
 from torchstickcal.objective import Objective
 from torchstickcal.problem import State
 from torchstickcal.solvers.base import IterationRecord, Listener, Outcome, Stop, Termination
-from torchstickcal.solvers.normal_equations import NormalEquations, Step, linearise
+from torchstickcal.solvers.normal_equations import NormalEquations, Step
 
 _INITIAL_DAMPING = 1e-5
 _MIN_DAMPING = 1e-14
@@ -35,75 +39,126 @@ def gauss_newton(
     A step is taken only if it lowers the cost, so the state returned is never worse than the one given.
     """
     _keep_freed_memory()
-    damping, step_m = _INITIAL_DAMPING, 0.0
-    exact = _EXACT_COST_PER_KEYPOINT * float(objective.measurements.visible.sum())
-    records: list[IterationRecord] = []
-    system = linearise(objective, state, cameras_free)
-    stop: Stop | None = None
-    for iteration in range(termination.max_iterations + 1):
-        records.append(system.record(stage, iteration, damping, step_m))
-        listener(records[-1])
-        if system.cost <= exact:
-            stop = Stop.EXACT
-        if stop is not None or iteration == termination.max_iterations:
-            break
-        move = _descend(objective, state, system, damping, termination, cameras_free)
-        if isinstance(move, Stop):
-            stop = move
-            break
-        decrease = system.cost - move.system.cost
-        if move.step.leash < _SHORT_LEASH:
-            if decrease <= termination.cost_tolerance * system.cost:
-                stop = Stop.COST
-            elif move.step.camera_sigmas <= termination.camera_tolerance:
-                stop = Stop.CAMERAS
-        state, system, damping, step_m = move.state, move.system, move.next_damping, _largest_movement(move.step)
-    return Outcome(state, stop or Stop.ITERATIONS, tuple(records))
+    keypoints = objective.measurements.visible.sum((1, 2)).tolist()
+    descents = [_Descent(termination, _EXACT_COST_PER_KEYPOINT * count) for count in keypoints]
+    records: list[list[IterationRecord]] = [[] for _ in descents]
+    best = trial = state
+    steps_m = [0.0] * len(descents)
+    while True:
+        damping = torch.tensor([descent.damping for descent in descents], dtype=torch.float64, device=state.points.device)
+        system = NormalEquations(objective, trial, cameras_free, damping)
+        lowered = [descent.judge(cost) for descent, cost in zip(descents, system.cost.tolist(), strict=True)]
+        if all(lowered):
+            best = trial
+        elif any(lowered):
+            best = best.replaced(torch.tensor(lowered, device=state.points.device), trial)
+        if any(lowered):
+            iterations = [descent.iteration for descent in descents]
+            found = system.records(stage, iterations, damping.tolist(), steps_m)
+            for session, record in enumerate(found):
+                if lowered[session]:
+                    records[session].append(record)
+                    listener(record)
+        moving = [False] * len(descents)
+        if any(descent.ready for descent in descents):
+            step = system.step()
+            promises = (step.solved, step.predicted_decrease, step.leash, step.camera_sigmas)
+            for descent, *promise in zip(descents, *(promise.tolist() for promise in promises), strict=True):
+                descent.propose(*promise)
+            moving = [descent.moving for descent in descents]
+            steps_m = _largest_movements(step)
+            trial = best.retracted(step.cameras, step.points)
+            del step
+        del system
+        if all(descent.stop for descent in descents):
+            stops = tuple(descent.stop or Stop.ITERATIONS for descent in descents)
+            return Outcome(best, stops, tuple(map(tuple, records)))
+        if not all(moving):
+            trial = best.replaced(torch.tensor(moving, device=state.points.device), trial) if any(moving) else best
 
 
-class _Move(NamedTuple):
-    """An accepted step: where it led, the system there, and the next damping."""
+class _Descent:
+    """How one session goes down: it judges where its step has led, and proposes the next.
 
-    state: State
-    system: NormalEquations
-    step: Step
-    next_damping: float
-
-
-def _descend(
-    objective: Objective,
-    state: State,
-    system: NormalEquations,
-    damping: float,
-    termination: Termination,
-    cameras_free: bool,
-) -> _Move | Stop:
-    """Raise the damping until a step lowers the cost, or say why none does.
-
-    A step that promises next to nothing is a sign of convergence only where it is not the damping that keeps it short.
+    The system at a trial is built with the damping of the step to follow, chosen before the trial's cost is known. Where
+    that turns out wrong, the session goes back to the best state and builds its system there again.
     """
-    refused = False
-    while damping <= _MAX_DAMPING:
-        step = system.step(damping)
-        if step is not None:
-            if step.predicted_decrease <= _NOTHING * termination.cost_tolerance * system.cost:
-                if refused or step.leash < _SHORT_LEASH or damping <= _MIN_DAMPING:
-                    return Stop.COST
-                damping = max(damping * _LOOSEN, _MIN_DAMPING)
-                continue
-            candidate = state.retracted(step.cameras, step.points)
-            reached = linearise(objective, candidate, cameras_free, replaced=system)
-            decrease = system.cost - reached.cost
-            if decrease > 0:
-                agreement = decrease / step.predicted_decrease
-                factor = _LOOSEN if agreement > 0.75 else 1.0 if agreement > 0.25 else 4.0
-                return _Move(candidate, reached, step, max(damping * factor, _MIN_DAMPING))
-            if step.predicted_decrease <= termination.cost_tolerance * system.cost:
-                return Stop.COST
-            system = linearise(objective, state, cameras_free, replaced=reached)
-        refused = True
-        damping = max(damping, 1e-8) * 10
-    return Stop.DIVERGED
+
+    def __init__(self, termination: Termination, exact_cost: float) -> None:
+        self._termination, self._exact_cost = termination, exact_cost
+        self._cost, self._predicted, self._leash, self._sigmas = math.inf, 0.0, 0.0, math.inf
+        self._step_damping, self._factor, self._refused = _INITIAL_DAMPING, _LOOSEN, False
+        self.damping = _INITIAL_DAMPING
+        self.iteration = -1
+        self.stop: Stop | None = None
+        self.moving = True
+        """whether the trial is another state than the best"""
+        self.ready = False
+        """whether the system just built is that of the best state"""
+
+    def judge(self, cost: float) -> bool:
+        """Take in the cost of the trial; True if it is the new best."""
+        self.ready = self.stop is None
+        if self.stop is not None or not self.moving:
+            return False
+        if self.iteration >= 0:
+            if not cost < self._cost:
+                self._refuse()
+                return False
+            self._conclude(self._cost - cost)
+        self._cost = cost
+        self.iteration += 1
+        if not math.isfinite(cost):
+            self.stop = Stop.DIVERGED
+        elif cost <= self._exact_cost:
+            self.stop = Stop.EXACT
+        elif self.stop is None and self.iteration == self._termination.max_iterations:
+            self.stop = Stop.ITERATIONS
+        self.ready = self.stop is None
+        return True
+
+    def propose(self, solved: bool, predicted: float, leash: float, sigmas: float) -> None:
+        """Take in what the step from the best state promises: go there, stay with another damping, or stop."""
+        self.moving = False
+        if not self.ready:
+            return
+        if not solved:
+            self._raise_damping(self.damping)
+        elif predicted <= _NOTHING * self._termination.cost_tolerance * self._cost:
+            # A step that promises next to nothing is a sign of convergence only if it is not damping that keeps it short.
+            if self._refused or leash < _SHORT_LEASH or self.damping <= _MIN_DAMPING:
+                self.stop = Stop.COST
+            self.damping = max(self.damping * _LOOSEN, _MIN_DAMPING)
+        else:
+            self.moving = True
+            self._predicted, self._leash, self._sigmas = predicted, leash, sigmas
+            self._step_damping = self.damping
+            self.damping = max(self.damping * self._factor, _MIN_DAMPING)
+
+    def _conclude(self, decrease: float) -> None:
+        """After a step that lowered the cost: how far to trust the next, and whether this was the last."""
+        agreement = decrease / self._predicted
+        self._factor = _LOOSEN if agreement > 0.75 else 1.0 if agreement > 0.25 else 4.0
+        self._refused = False
+        if self._leash < _SHORT_LEASH:
+            if decrease <= self._termination.cost_tolerance * self._cost:
+                self.stop = Stop.COST
+            elif self._sigmas <= self._termination.camera_tolerance:
+                self.stop = Stop.CAMERAS
+
+    def _refuse(self) -> None:
+        """After a step that did not lower the cost."""
+        self.ready = self.moving = False
+        if self._predicted <= self._termination.cost_tolerance * self._cost:
+            self.stop = Stop.COST
+        else:
+            self._raise_damping(self._step_damping)
+
+    def _raise_damping(self, above: float) -> None:
+        self._refused, self._factor = True, 1.0
+        self.damping = max(above, 1e-8) * 10
+        if self.damping > _MAX_DAMPING:
+            self.stop = Stop.DIVERGED
 
 
 def _keep_freed_memory() -> None:
@@ -115,6 +170,8 @@ def _keep_freed_memory() -> None:
     torch.empty(_LARGE_BLOCK_BYTES, dtype=torch.uint8)
 
 
-def _largest_movement(step: Step) -> float:
-    cameras = float(step.cameras.abs().max()) if step.cameras.numel() else 0.0
-    return max(cameras, float(step.points.abs().max()))
+def _largest_movements(step: Step) -> list[float]:
+    largest = step.points.abs().amax((1, 2))
+    if step.cameras.numel():
+        largest = torch.maximum(largest, step.cameras.abs().amax((1, 2)))
+    return largest.tolist()

@@ -7,6 +7,8 @@ and stalls where only the sum of all points sees a direction, as it is with the 
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import torch
 from torch import Tensor
 
@@ -14,25 +16,23 @@ from torchstickcal.extrinsics import Extrinsics
 from torchstickcal.objective import Objective
 from torchstickcal.problem import State
 from torchstickcal.solvers.base import IterationRecord, Listener, Outcome, Stop, Termination
-from torchstickcal.solvers.normal_equations import NormalEquations, linearise
+from torchstickcal.solvers.normal_equations import NormalEquations
 from torchstickcal.solvers.point_elimination import PointElimination
-from torchstickcal.symmetric import DIAGONAL
+from torchstickcal.symmetric import raised
 
 _ITERATIONS_A_ROUND = 100
 _DAMPING = 1e-6
 
 
 class _ScaledUnknowns:
-    """Poses and points as functions of well-scaled unknowns that are zero at the start."""
+    """Poses and points of one session as functions of well-scaled unknowns that are zero at the start."""
 
     def __init__(self, system: NormalEquations, start: State) -> None:
-        hessian = system.point_hessian.clone()
-        hessian[DIAGONAL] *= 1 + _DAMPING
-        measurements = system.objective.measurements
-        self._points = PointElimination(measurements.by_frame(hessian), measurements.pairs, None)
-        self._cameras = torch.linalg.cholesky(system.reduced_system(_DAMPING)[0]).mT
-        self._response = system.response(_DAMPING).flatten(1).mT
-        self._extrinsics = Extrinsics(start.rotations, start.translations)
+        hessian, pairs = raised(system.point_hessian, _DAMPING), system.objective.measurements.pairs
+        self._points = PointElimination(hessian, pairs[:0, 0], pairs[:0, 1], None)
+        self._cameras = torch.linalg.cholesky(system.reduced[0]).mT
+        self._response = system.response()[0].flatten(1).mT
+        self._extrinsics = Extrinsics(start.rotations[0], start.translations[0])
         self._start = start
         self.camera = start.points.new_zeros(len(self._cameras), 1).requires_grad_()
         self.point = torch.zeros_like(start.points).requires_grad_()
@@ -46,7 +46,9 @@ class _ScaledUnknowns:
         rotations, translations = self._extrinsics.compose(tangents.view(-1, 6))
         points = points + (self._response @ tangents).view_as(points)
         return State(
-            torch.cat([self._start.rotations[:1], rotations]), torch.cat([self._start.translations[:1], translations]), points
+            torch.cat([self._start.rotations[:, :1], rotations[None]], dim=1),
+            torch.cat([self._start.translations[:, :1], translations[None]], dim=1),
+            points,
         )
 
 
@@ -59,16 +61,38 @@ def lbfgs(
     stage: str,
     listener: Listener,
 ) -> Outcome:
-    """Minimise an objective over the points and, unless held, all cameras but the first.
+    """Minimise an objective over the points and, unless held, all cameras but the first, one session after the other.
 
     It runs in rounds, each with fresh scales and a fresh history; a record stands for a round, and the limit of iterations
     counts rounds.
     """
+    states: list[State] = []
+    stops: list[Stop] = []
+    records: list[tuple[IterationRecord, ...]] = []
+    for session in range(objective.measurements.sessions):
+        one = slice(session, session + 1)
+        ended, stop, heard = _descend(objective[one], state[one], session, cameras_free, termination, stage, listener)
+        states.append(ended)
+        stops.append(stop)
+        records.append(heard)
+    return Outcome(State.stack(states), tuple(stops), tuple(records))
+
+
+def _descend(
+    objective: Objective,
+    state: State,
+    session: int,
+    cameras_free: bool,
+    termination: Termination,
+    stage: str,
+    listener: Listener,
+) -> tuple[State, Stop, tuple[IterationRecord, ...]]:
     stop, step_m = Stop.ITERATIONS, 0.0
     records: list[IterationRecord] = []
     for iteration in range(termination.max_iterations + 1):
-        system = linearise(objective, state, cameras_free)
-        records.append(system.record(stage, iteration, damping=0.0, step_m=step_m))
+        system = NormalEquations(objective, state, cameras_free, _DAMPING)
+        (record,) = system.records(stage, [iteration], [0.0], [step_m])
+        records.append(replace(record, session=session))
         listener(records[-1])
         if iteration and records[-2].cost - records[-1].cost <= termination.cost_tolerance * records[-1].cost:
             stop = Stop.COST
@@ -81,7 +105,7 @@ def lbfgs(
             break
         step_m = float((moved.points - state.points).abs().max())
         state = moved
-    return Outcome(state, stop, tuple(records))
+    return state, stop, tuple(records)
 
 
 def _round(objective: Objective, unknowns: _ScaledUnknowns) -> State:
@@ -97,7 +121,7 @@ def _round(objective: Objective, unknowns: _ScaledUnknowns) -> State:
     def closure() -> Tensor:
         optimiser.zero_grad()
         state = unknowns.state()
-        points = objective.measurements.by_frame(state.points).movedim(0, -1)
+        points = objective.measurements.by_frame(state.points).movedim(1, -1)
         cost = torch.stack(list(objective.terms(state.rotations, state.translations, points).values())).sum()
         cost.backward()
         return cost

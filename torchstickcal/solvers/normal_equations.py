@@ -4,13 +4,15 @@ With the world-side perturbation ``T <- T Exp(delta)`` the derivative of a proje
 the point times ``B(X) = [I, -[X]x]``, the same for all cameras. So everything follows from one 3 x 3 block N and one
 gradient g per camera and point: H_xx = sum_c N_c, H_xc = N_c B, H_cc = sum B^T N_c B. With H_xx = L L^T and W = L^-1 H_xc
 the reduced camera system is S = H_cc - W^T W.
+
+One pass over the parts of the structure builds a part's blocks, eliminates it and adds its share to S while all of it is in
+the cache. What the back-substitution needs again is kept where it is small, and computed again where it is not.
 """
 
 from __future__ import annotations
 
 import itertools
 import math
-from dataclasses import dataclass
 from functools import lru_cache, reduce
 from typing import NamedTuple
 
@@ -19,265 +21,261 @@ from torch import Tensor
 
 from torchstickcal import se3
 from torchstickcal.objective import Objective
-from torchstickcal.problem import State
+from torchstickcal.problem import Columns, State
 from torchstickcal.solvers.base import IterationRecord
 from torchstickcal.solvers.cross_blocks import cross_rows, symmetric_times
+from torchstickcal.solvers.parts import Couplings, Part, parts
 from torchstickcal.solvers.point_elimination import PointElimination
 from torchstickcal.solvers.track_elimination import TrackElimination
-from torchstickcal.symmetric import DIAGONAL, IDENTITY, outer
+from torchstickcal.symmetric import DIAGONAL, IDENTITY, inverse_diagonal, outer, raised
 
-_ELIMINATED_COLUMNS = 30000
+_KEPT_BYTES = 2**28
+"""Size of the blocks N_c up to which they are kept for the back-substitution."""
 
 
 class Step(NamedTuple):
-    """A step of the unknowns and the decrease of the cost that the quadratic model promises for it."""
+    """A step of the unknowns and the decrease of the cost that the quadratic model promises for it, for B sessions."""
 
     cameras: Tensor
-    """(C - 1, 6) tangents, (0, 6) where the cameras are held"""
+    """(B, C - 1, 6) tangents, (B, 0, 6) where the cameras are held"""
     points: Tensor
-    """(3, N), metres"""
-    predicted_decrease: float
-    leash: float
-    """share of the descent that damping holds back, 0 to 1: near 1 the step is short because it is damped"""
-    camera_sigmas: float
-    """length of the cameras' step in standard deviations of their estimate; infinite where they are held"""
+    """(B, 3, N), metres"""
+    solved: Tensor
+    """(B,), False where the damped system is not positive definite and the step is worthless"""
+    predicted_decrease: Tensor
+    """(B,)"""
+    leash: Tensor
+    """(B,), share of the descent that damping holds back, 0 to 1: near 1 the step is short because it is damped"""
+    camera_sigmas: Tensor
+    """(B,), length of the cameras' step in standard deviations of their estimate; infinite where they are held"""
 
 
-@dataclass(frozen=True)
-class NormalEquations:
-    """The undamped system at one state; C' is the number of cameras solved for (all but the first, or none)."""
+class _Eliminated(NamedTuple):
+    """A part with its coupling to the cameras, the blocks N_c (B, C', 6, n), and the factor of its own Hessian."""
 
-    terms: dict[str, float]
-    """value of each loss"""
-    reprojection_px: Tensor
-    """(C,), weighted root mean square of the reprojection residuals"""
-    points: Tensor
-    """(3, N), where the system was built"""
-    camera_hessian: Tensor
-    """(C', 6, 6), blocks H_cc"""
-    camera_gradient: Tensor
-    """(C', 6)"""
     cross: Tensor
-    """(C', 6, N), the blocks N_c, entries xx xy xz yy yz zz"""
+    elimination: PointElimination | TrackElimination
+
+
+class NormalEquations:
+    """The system of B sessions at one state; C' is the number of cameras solved for (all but the first, or none).
+
+    Args:
+        objective: the losses on their sessions.
+        state: where.
+        cameras_free: whether the cameras are unknowns; the first one never is.
+        damping: factor by which the diagonal of the Hessian is raised, one number or one per session (B,).
+    """
+
+    terms: dict[str, Tensor]
+    """value of each loss, (B,)"""
+    reprojection_px: Tensor
+    """(B, C), weighted root mean square of the reprojection residuals"""
     point_hessian: Tensor
-    """(6, N), diagonal blocks H_xx"""
+    """(B, 6, N), diagonal blocks H_xx, undamped"""
     point_gradient: Tensor
-    """(3, N)"""
-    objective: Objective
-    pair_coupling: Tensor | None
-    """(6, F, S), minus the blocks between a stick's ends"""
-    next_frame: Tensor | None
-    second_frame: Tensor | None
-    """multiples of the identity between a point's frames, (F - 1, P) and (F - 2, P)"""
+    """(B, 3, N)"""
+    camera_gradient: Tensor
+    """(B, C', 6)"""
+    reduced: Tensor
+    """(B, 6 C', 6 C'), the reduced camera system S"""
+    reduced_gradient: Tensor
+    """(B, 6 C'), the gradient that is left for the cameras once the points follow them"""
+
+    def __init__(self, objective: Objective, state: State, cameras_free: bool, damping: float | Tensor = 0.0) -> None:
+        m = objective.measurements
+        self.objective, self.state = objective, state
+        self._count = m.num_cameras - 1 if cameras_free else 0
+        self._damping = torch.as_tensor(damping, dtype=torch.float64, device=state.points.device).expand(m.sessions)
+        self.terms = {name: state.points.new_zeros(m.sessions) for name in objective.losses}
+        self._add_structure()
+        self._parts = parts(m, self._couplings)
+        self._kept: list[_Eliminated] | None = None
+        self._add_keypoints()
 
     @property
-    def cost(self) -> float:
-        """The objective's value."""
-        return sum(self.terms.values())
+    def cost(self) -> Tensor:
+        """The objective's value, (B,)."""
+        return torch.stack(list(self.terms.values())).sum(0)
 
-    def step(self, damping: float) -> Step | None:
-        """The Levenberg-Marquardt step; None where the damped system is not positive definite.
-
-        Args:
-            damping: factor by which the diagonal of the Hessian is raised.
-        """
-        reduced, rhs, eliminations = self._reduce(damping)
-        factor, failed = torch.linalg.cholesky_ex(reduced)
-        if int(failed) or not bool(factor.isfinite().all()):
-            return None
-        camera_step = -torch.cholesky_solve(rhs[:, None], factor).view(-1, 6)
-        point_step = torch.empty_like(self.point_gradient)
-        for columns, elimination in eliminations:
-            point_step[:, columns] = -elimination.solve(self.point_gradient[:, columns] + self._carried(columns, camera_step))
-        diagonal = self.point_hessian[DIAGONAL]
-        descent = -float((self.camera_gradient * camera_step).sum() + (self.point_gradient * point_step).sum())
-        camera_diagonal = self.camera_hessian.diagonal(dim1=1, dim2=2)
-        held = damping * float((camera_diagonal * camera_step**2).sum() + (diagonal * point_step**2).sum())
-        squared_sigmas = -float((rhs * camera_step.flatten()).sum()) if rhs.numel() else math.inf
+    def step(self) -> Step:
+        """The Levenberg-Marquardt step."""
+        sessions, gradient, hessian = len(self.reduced), self.point_gradient, self.point_hessian
+        factor, failed = torch.linalg.cholesky_ex(self.reduced)
+        camera_step = -torch.cholesky_solve(self.reduced_gradient[..., None], factor)[..., 0].view(sessions, -1, 6)
+        point_step = torch.empty_like(gradient)
+        descent = -(self.camera_gradient * camera_step).sum((1, 2))
+        held = (self._camera_diagonal * camera_step.square()).sum((1, 2))
+        for index, part in enumerate(self._parts):
+            cross, elimination = self._kept[index] if self._kept else self._eliminated(part)
+            rhs = gradient[..., part.columns]
+            solved = elimination.solve(rhs + self._carried(part, cross, camera_step)).neg_()
+            point_step[..., part.columns] = solved
+            descent -= (rhs * solved).sum((1, 2), dtype=torch.float64)
+            held += (hessian[..., part.columns][:, DIAGONAL] * solved.square()).sum((1, 2), dtype=torch.float64)
+        held = held * self._damping
+        squared_sigmas = -(self.reduced_gradient * camera_step.flatten(1)).sum(1)
         return Step(
             cameras=camera_step,
             points=point_step,
+            solved=(failed == 0) & camera_step.flatten(1).isfinite().all(1),
             predicted_decrease=descent + held,
-            leash=held / max(descent, 1e-300),
-            camera_sigmas=math.sqrt(max(squared_sigmas, 0.0)),
+            leash=held / descent.clamp_min(1e-300),
+            camera_sigmas=squared_sigmas.clamp_min(0.0).sqrt() if self._count else squared_sigmas.fill_(math.inf),
         )
 
     def point_variance(self) -> Tensor:
-        """Mean variance along the axes of each point (N,), cameras known, stick ends taken singly, square metres."""
-        by_frame = self.objective.measurements.by_frame(self.point_hessian)
-        return PointElimination(by_frame, self.objective.measurements.pairs, None).variances().mean(0)
+        """Mean variance along the axes of each point (B, N), cameras known, stick ends taken singly, square metres."""
+        variance = torch.empty_like(self.point_hessian[:, 0])
+        for columns in self.objective.measurements.chunks():
+            variance[:, columns] = inverse_diagonal(self.point_hessian[..., columns]).mean(1)
+        return variance
 
-    def record(self, stage: str, iteration: int, damping: float, step_m: float) -> IterationRecord:
-        """The record of the iteration that ends here."""
-        lengths = self.objective.measurements.stick_lengths_m(self.points)
-        return IterationRecord(
-            stage=stage,
-            iteration=iteration,
-            cost=self.cost,
-            terms=self.terms,
-            damping=damping,
-            step_m=step_m,
-            reprojection_px=tuple(self.reprojection_px.tolist()),
-            stick_length_m=float(lengths.nanmean()) if lengths.numel() else math.nan,
-        )
-
-    def reduced_system(self, damping: float = 0.0) -> tuple[Tensor, Tensor]:
-        """The reduced camera system: S (6 C', 6 C') and its right-hand side's negative (6 C',)."""
-        reduced, rhs, _ = self._reduce(damping)
-        return reduced, rhs
-
-    def response(self, damping: float) -> Tensor:
-        """How the points follow the cameras: ``-H_xx^-1 H_xc`` as (6 C', 3, N), a step of the points per unit of tangent."""
-        response = self.points.new_empty(6 * self.camera_hessian.shape[0], *self.points.shape)
-        for columns in self._slices():
-            elimination = self._eliminate(columns, damping)
-            rows = cross_rows(self.cross[:, :, columns], self.points[:, columns]).flatten(0, 1)
-            for row, solved in zip(rows, response[..., columns], strict=True):
-                solved.copy_(-elimination.solve(row))
+    def response(self) -> Tensor:
+        """How the points follow the cameras: ``-H_xx^-1 H_xc`` as (B, 6 C', 3, N), a step of the points per unit of tangent."""
+        points = self.state.points
+        response = points.new_empty(len(points), 6 * self._count, *points.shape[1:])
+        for part in self._parts:
+            cross, elimination = self._eliminated(part)
+            rows = cross_rows(cross, points[..., part.columns]).flatten(1, 2)
+            for row in range(rows.shape[1]):
+                response[:, row][..., part.columns] = -elimination.solve(rows[:, row])
         return response
 
-    def _carried(self, columns: slice, camera_step: Tensor) -> Tensor:
-        """``H_xc`` times a step of the cameras, (3, n)."""
-        carried = torch.empty_like(self.points[:, columns])
-        twists, shifts = se3.hat(camera_step[:, 3:]), camera_step[:, :3, None]
-        for part in self.objective.measurements.chunks(columns):
-            moved = torch.baddbmm(shifts, twists, self.points[:, part].expand(len(twists), -1, -1))
-            offset = columns.start or 0
-            carried[:, part.start - offset : part.stop - offset] = symmetric_times(self.cross[:, :, part], moved)
-        return carried
+    def records(self, stage: str, iterations: list[int], dampings: list[float], steps_m: list[float]) -> list[IterationRecord]:
+        """The records of the iterations that end here, one for each session."""
+        m = self.objective.measurements
+        terms = {name: value.tolist() for name, value in self.terms.items()}
+        lengths = m.stick_lengths_m(self.state.points).flatten(1).nanmean(1).tolist()
+        return [
+            IterationRecord(
+                session=session,
+                stage=stage,
+                iteration=iterations[session],
+                cost=sum(values[session] for values in terms.values()),
+                terms={name: values[session] for name, values in terms.items()},
+                damping=dampings[session],
+                step_m=steps_m[session],
+                reprojection_px=tuple(pixels),
+                stick_length_m=lengths[session],
+            )
+            for session, pixels in enumerate(self.reprojection_px.tolist())
+        ]
 
-    def _reduce(self, damping: float) -> tuple[Tensor, Tensor, list[tuple[slice, PointElimination | TrackElimination]]]:
-        """The reduced system, and the eliminations of the points with the columns they hold."""
-        count = self.camera_hessian.shape[0]
-        reduced = torch.block_diag(*_damped(self.camera_hessian, damping)) if count else self.cross.new_zeros(0, 0)
-        rhs = self.camera_gradient.flatten().clone()
-        eliminations: list[tuple[slice, PointElimination | TrackElimination]] = []
-        for columns in self._slices():
-            elimination = self._eliminate(columns, damping)
+    def _add_structure(self) -> None:
+        """What the losses on points alone contribute, and the couplings they make."""
+        m = self.objective.measurements
+        self.point_hessian = m.pixels.new_zeros(m.sessions, 6, m.num_columns)
+        self.point_gradient = m.pixels.new_zeros(m.sessions, 3, m.num_columns)
+        if not bool(m.active.all()):
+            identity = self.point_hessian.new_tensor(IDENTITY)[:, None]
+            self.point_hessian.copy_(torch.where(m.active[:, None], self.point_hessian, identity))
+        self._couplings = Couplings(self._add_pairs(), *self._add_tracks())
+
+    def _add_pairs(self) -> Tensor | None:
+        """Add the pair losses to the points' blocks; returns the coupling (B, 6, F, S)."""
+        m, coupling = self.objective.measurements, None
+        starts, ends = m.pairs.unbind(1)
+        hessian, gradient = m.by_frame(self.point_hessian), m.by_frame(self.point_gradient)
+        for name, pair in self.objective.linearise_pairs(self.state).items():
+            self.terms[name] = self.terms[name] + pair.cost
+            block = outer(pair.jacobian.flatten(2)).unflatten(-1, pair.residual.shape[1:]).to(hessian.dtype)
+            slope = (pair.jacobian * pair.residual[:, None]).to(hessian.dtype)
+            hessian[..., starts] += block
+            hessian[..., ends] += block
+            gradient[..., starts] -= slope
+            gradient[..., ends] += slope
+            coupling = block if coupling is None else coupling + block
+        return coupling
+
+    def _add_tracks(self) -> tuple[Tensor | None, Tensor | None]:
+        """Add the track losses to the points' blocks; returns the couplings to the next and the second-next frame."""
+        m = self.objective.measurements
+        if not self.objective.couples_frames:
+            return None, None
+        hessian, gradient = m.by_frame(self.point_hessian), m.by_frame(self.point_gradient)
+        next_frame, second_frame = (hessian.new_zeros(m.sessions, m.frames - k, m.points_per_frame) for k in (1, 2))
+        frames = m.frames - 2
+        for name, track in self.objective.linearise_tracks(self.state).items():
+            self.terms[name] = self.terms[name] + track.cost
+            information, slope = track.scale.square().to(hessian.dtype), (track.scale[:, None] * track.residual)
+            for offset, factor in enumerate((1.0, -2.0, 1.0)):
+                gradient[:, :, offset : offset + frames] += factor * slope
+                for axis in DIAGONAL:
+                    hessian[:, axis, offset : offset + frames] += factor**2 * information
+            next_frame[:, :-1] -= 2 * information
+            next_frame[:, 1:] -= 2 * information
+            second_frame += information
+        return next_frame, second_frame
+
+    def _add_keypoints(self) -> None:
+        """The camera-point losses of every part, and its elimination where the cameras are unknowns."""
+        m, count, zeros = self.objective.measurements, self._count, self.state.points.new_zeros
+        squares, weights = zeros(m.sessions, m.num_cameras), zeros(m.sessions, m.num_cameras)
+        gradient_moments, hessian_moments = zeros(m.sessions, 3 * count, 4), zeros(m.sessions, 6 * count, 10)
+        reduced, reduced_gradient = zeros(m.sessions, 6 * count, 6 * count), zeros(m.sessions, 6 * count)
+        if count * m.sessions * m.num_columns * 6 * m.pixels.element_size() <= _KEPT_BYTES:
+            self._kept = []
+        for part in self._parts:
+            crosses: list[Tensor] = []
+            for columns in part.chunks:
+                blocks = self.objective.linearise_chunk(self.state, columns)
+                for name, block in blocks.items():
+                    self.terms[name] = self.terms[name] + block.cost
+                    squares += block.squares
+                    weights += block.weights
+                gradient = reduce(torch.add, (block.gradient for block in blocks.values()))
+                hessian = reduce(torch.add, (block.hessian for block in blocks.values()))
+                self.point_gradient[..., columns] += gradient.sum(1)
+                self.point_hessian[..., columns] += hessian.sum(1)
+                if count:
+                    points = self._points(columns)
+                    homogeneous = torch.cat([torch.ones_like(points[:, :1]), points], dim=1)
+                    products = homogeneous[:, _PRODUCTS[0]] * homogeneous[:, _PRODUCTS[1]]
+                    gradient_moments += gradient[:, 1:].flatten(1, 2) @ homogeneous.mT
+                    hessian_moments += hessian[:, 1:].flatten(1, 2) @ products.mT
+                    crosses.append(hessian[:, 1:])
             if count:
-                arguments = self.cross[:, :, columns], self.points[:, columns], self.point_gradient[:, columns]
-                for rows, half in elimination.reductions(*arguments):
-                    reduced.addmm_(rows, rows.mT, alpha=-1)
-                    rhs.addmv_(rows, half, alpha=-1)
-            eliminations.append((columns, elimination))
-        return reduced, rhs, eliminations
+                eliminated = self._eliminated(part, crosses)
+                rows, half = eliminated.elimination.reductions(
+                    eliminated.cross, self._points(part.columns), self.point_gradient[..., part.columns]
+                )
+                reduced -= rows @ rows.mT
+                reduced_gradient -= (rows @ half[..., None])[..., 0]
+                if self._kept is not None:
+                    self._kept.append(eliminated)
+        gradient_map, hessian_map = _moment_maps(self.state.points.device)
+        blocks = (hessian_moments.view(m.sessions, count, 60) @ hessian_map).view(m.sessions, count, 6, 6)
+        self._camera_diagonal = blocks.diagonal(dim1=2, dim2=3).clone()
+        blocks.diagonal(dim1=2, dim2=3).mul_(1 + self._damping[:, None, None])
+        on_diagonal = reduced.view(m.sessions, count, 6, count, 6).diagonal(dim1=1, dim2=3)
+        on_diagonal += blocks.permute(0, 2, 3, 1)
+        self.camera_gradient = gradient_moments.view(m.sessions, count, 12) @ gradient_map
+        self.reduced, self.reduced_gradient = reduced, reduced_gradient + self.camera_gradient.flatten(1)
+        self.reprojection_px = (squares / weights.clamp_min(1e-300)).sqrt()
 
-    def _slices(self) -> list[slice]:
-        """Columns that are eliminated together: all where tracks couple them, else as many as keep torch from threading."""
-        m = self.objective.measurements
-        frames = m.frames if self.next_frame is not None else max(1, _ELIMINATED_COLUMNS // m.points_per_frame)
-        width = frames * m.points_per_frame
-        return [slice(first, min(first + width, self.points.shape[1])) for first in range(0, self.points.shape[1], width)]
+    def _eliminated(self, part: Part, crosses: list[Tensor] | None = None) -> _Eliminated:
+        """A part's factor and coupling to the cameras, of its blocks N_c by chunk where they are at hand."""
+        if crosses is None:
+            crosses = [self._cross(columns) for columns in part.chunks]
+        cross = crosses[0] if len(crosses) == 1 else torch.cat(crosses, dim=-1)
+        return _Eliminated(cross, part.eliminate(raised(self.point_hessian[..., part.columns], self._damping)))
 
-    def _eliminate(self, columns: slice, damping: float) -> PointElimination | TrackElimination:
-        m = self.objective.measurements
-        hessian = self.point_hessian[:, columns].clone()
-        hessian[DIAGONAL] *= 1 + damping
-        by_frame = hessian.unflatten(1, (-1, m.points_per_frame))
-        if self.next_frame is not None and self.second_frame is not None:
-            return TrackElimination(by_frame, m.pairs, self.pair_coupling, self.next_frame, self.second_frame)
-        coupling = self.pair_coupling
-        if coupling is not None:
-            coupling = coupling[:, columns.start // m.points_per_frame : columns.stop // m.points_per_frame]
-        return PointElimination(by_frame, m.pairs, coupling)
+    def _cross(self, columns: Columns) -> Tensor:
+        """The blocks N_c of the cameras solved for, (B, C', 6, n)."""
+        if not self._count:
+            return self.point_hessian[:, None, :, columns][:, :0]
+        blocks = self.objective.linearise_chunk(self.state, columns).values()
+        return reduce(torch.add, (block.hessian for block in blocks))[:, 1:]
 
+    def _carried(self, part: Part, cross: Tensor, camera_step: Tensor) -> Tensor:
+        """``H_xc`` times a step of the cameras, (B, 3, n)."""
+        points = self.state.points[..., part.columns]
+        moved = se3.moved(se3.hat(camera_step[..., 3:]), camera_step[..., :3], points)
+        return symmetric_times(cross, moved.to(cross.dtype))
 
-def linearise(
-    objective: Objective, state: State, cameras_free: bool, replaced: NormalEquations | None = None
-) -> NormalEquations:
-    """Build the Gauss-Newton system of an objective at a state.
-
-    Args:
-        objective: the losses on their session.
-        state: where.
-        cameras_free: whether the cameras are unknowns; the first one never is.
-        replaced: a system of the same objective that is not needed any more, whose largest array may be overwritten.
-    """
-    m = objective.measurements
-    free = slice(1, None) if cameras_free else slice(0, 0)
-    cameras, total = m.confidence.shape
-    count = cameras - 1 if cameras_free else 0
-    points = state.points
-    costs = {name: points.new_zeros(()) for name in objective.losses}
-    squares, weights = points.new_zeros(cameras), points.new_zeros(cameras)
-    cross = points.new_empty(count, 6, total) if replaced is None else replaced.cross
-    point_hessian, point_gradient = points.new_empty(6, total), points.new_empty(3, total)
-    gradient_moments, hessian_moments = points.new_zeros(3 * count, 4), points.new_zeros(6 * count, 10)
-    for columns in m.chunks():
-        homogeneous = torch.cat([torch.ones_like(points[:1, columns]), points[:, columns]])
-        products = homogeneous[_PRODUCTS[0]] * homogeneous[_PRODUCTS[1]]
-        blocks = objective.linearise_chunk(state, columns)
-        for name, block in blocks.items():
-            costs[name] += block.cost
-            squares += block.squares
-            weights += block.weights
-        gradient = reduce(torch.add, (block.gradient for block in blocks.values()))
-        hessian = reduce(torch.add, (block.hessian for block in blocks.values()))
-        torch.sum(gradient, 0, out=point_gradient[:, columns])
-        torch.sum(hessian, 0, out=point_hessian[:, columns])
-        if count:
-            cross[:, :, columns] = hessian[free]
-            gradient_moments.addmm_(gradient[free].flatten(0, 1), homogeneous.mT)
-            hessian_moments.addmm_(hessian[free].flatten(0, 1), products.mT)
-    terms = {name: float(cost) for name, cost in costs.items()}
-    if len(m.inactive_columns):
-        point_hessian[:, m.inactive_columns] = point_hessian.new_tensor(IDENTITY)[:, None]
-    pair_coupling = _add_pairs(objective, state, terms, m.by_frame(point_hessian), m.by_frame(point_gradient))
-    bands = _add_tracks(objective, state, terms, m.by_frame(point_hessian), m.by_frame(point_gradient))
-    gradient_map, hessian_map = _moment_maps(points.dtype, points.device)
-    return NormalEquations(
-        terms=terms,
-        reprojection_px=(squares / weights.clamp_min(1e-300)).sqrt(),
-        points=points,
-        camera_hessian=(hessian_moments.view(count, 60) @ hessian_map).view(count, 6, 6),
-        camera_gradient=gradient_moments.view(count, 12) @ gradient_map,
-        cross=cross,
-        point_hessian=point_hessian,
-        point_gradient=point_gradient,
-        objective=objective,
-        pair_coupling=pair_coupling,
-        next_frame=bands[0],
-        second_frame=bands[1],
-    )
-
-
-def _add_pairs(objective: Objective, state: State, terms: dict[str, float], hessian: Tensor, gradient: Tensor) -> Tensor | None:
-    """Add the pair losses to the points' blocks (6, F, P) and (3, F, P); returns the coupling (6, F, S)."""
-    coupling: Tensor | None = None
-    starts, ends = objective.measurements.pairs.unbind(1)
-    for name, pair in objective.linearise_pairs(state).items():
-        terms[name] += float(pair.cost)
-        block, slope = outer(pair.jacobian), pair.jacobian * pair.residual
-        hessian[..., starts] += block
-        hessian[..., ends] += block
-        gradient[..., starts] -= slope
-        gradient[..., ends] += slope
-        coupling = block if coupling is None else coupling + block
-    return coupling
-
-
-def _add_tracks(
-    objective: Objective, state: State, terms: dict[str, float], hessian: Tensor, gradient: Tensor
-) -> tuple[Tensor | None, Tensor | None]:
-    """Add the track losses to the points' blocks; returns the couplings to the next and the second-next frame."""
-    if not objective.couples_frames:
-        return None, None
-    next_frame, second_frame = (hessian.new_zeros(hessian.shape[1] - k, hessian.shape[2]) for k in (1, 2))
-    frames = second_frame.shape[0]
-    for name, track in objective.linearise_tracks(state).items():
-        terms[name] += float(track.cost)
-        information = track.scale.square()
-        for offset, factor in enumerate((1.0, -2.0, 1.0)):
-            gradient[:, offset : offset + frames] += factor * track.scale * track.residual
-            hessian[DIAGONAL, offset : offset + frames] += factor**2 * information
-        next_frame[:-1] -= 2 * information
-        next_frame[1:] -= 2 * information
-        second_frame += information
-    return next_frame, second_frame
-
-
-def _damped(blocks: Tensor, damping: float) -> Tensor:
-    return blocks + damping * blocks.diagonal(dim1=1, dim2=2).diag_embed()
+    def _points(self, columns: Columns) -> Tensor:
+        return self.state.points[..., columns].to(self.point_hessian.dtype)
 
 
 _PRODUCTS = ([0, 0, 0, 0, 1, 1, 1, 2, 2, 3], [0, 1, 2, 3, 1, 2, 3, 2, 3, 3])
@@ -285,16 +283,16 @@ _PRODUCTS = ([0, 0, 0, 0, 1, 1, 1, 2, 2, 3], [0, 1, 2, 3, 1, 2, 3, 2, 3, 3])
 
 
 @lru_cache(maxsize=8)
-def _moment_maps(dtype: torch.dtype, device: torch.device) -> tuple[Tensor, Tensor]:
+def _moment_maps(device: torch.device) -> tuple[Tensor, Tensor]:
     """The maps from moments of gradients (12) and of Hessians (60) to those of a camera, (12, 6) and (60, 36).
 
     With B(X) = sum_a (1, X)_a B_a the sums of B^T g and B^T N B over the points are linear in the moments of g with
     (1, x, y, z) and of N with their ten products.
     """
-    basis = torch.zeros(4, 3, 6, dtype=dtype)
+    basis = torch.zeros(4, 3, 6, dtype=torch.float64)
     basis[0, :, :3] = torch.eye(3)
-    basis[1:, :, 3:] = -se3.hat(torch.eye(3, dtype=dtype))
-    hessian_map = torch.zeros(6, 10, 6, 6, dtype=dtype)
+    basis[1:, :, 3:] = -se3.hat(torch.eye(3, dtype=torch.float64))
+    hessian_map = torch.zeros(6, 10, 6, 6, dtype=torch.float64)
     entries = torch.tensor([[0, 1, 2], [1, 3, 4], [2, 4, 5]])
     product = torch.zeros(4, 4, dtype=torch.long)
     product[_PRODUCTS] = product[_PRODUCTS[::-1]] = torch.arange(10)

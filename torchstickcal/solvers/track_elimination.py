@@ -7,8 +7,6 @@ what is left is block tridiagonal again with half as many blocks. Stick ends for
 
 from __future__ import annotations
 
-import itertools
-from collections.abc import Iterator
 from typing import NamedTuple
 
 import torch
@@ -16,9 +14,6 @@ from torch import Tensor
 
 from torchstickcal.solvers.cross_blocks import cross_rows
 from torchstickcal.symmetric import expand
-
-_PART_POINTS = 3000
-"""Points worked on at a time, so that their right-hand sides stay in the cache."""
 
 
 class _Level(NamedTuple):
@@ -82,79 +77,47 @@ def _inverse_factor(blocks: Tensor) -> Tensor:
     return torch.linalg.solve_triangular(torch.linalg.cholesky(blocks), identity, upper=False)
 
 
-class _Part(NamedTuple):
-    """Tracks that are eliminated together: their points (T, 1), or pairs of points (T, 2) with their coupling (6, F, T)."""
-
-    members: Tensor
-    between: Tensor | None
-
-
 class TrackElimination:
-    """Cholesky factor of the structure's Hessian with coupling over time.
+    """Cholesky factor of the structure's Hessian with coupling over time, for T tracks of q points each.
 
     Args:
-        hessian: diagonal blocks (6, F, P) of the points, entries xx xy xz yy yz zz, the losses' shares included.
-        pairs: (S, 2) points that form one track, ends of one stick.
-        coupling: (6, F, S), the blocks -M between a pair's points in a frame, or None.
-        next_frame: (F - 1, P), the multiple of the identity that couples frames f and f + 1.
-        second_frame: (F - 2, P), the same for frames f and f + 2.
+        hessian: diagonal blocks (B, 6, T, F, q) of the points, entries xx xy xz yy yz zz, the losses' shares included.
+        coupling: (B, 6, F, T), the blocks -M between the two points of a track in a frame; None where q is 1.
+        next_frame: (B, F - 1, T, q), the multiple of the identity that couples frames f and f + 1.
+        second_frame: (B, F - 2, T, q), the same for frames f and f + 2.
     """
 
-    def __init__(
-        self, hessian: Tensor, pairs: Tensor, coupling: Tensor | None, next_frame: Tensor, second_frame: Tensor
-    ) -> None:
-        self._hessian, self._next_frame, self._second_frame = hessian, next_frame, second_frame
-        _, self._frames, self._points = hessian.shape
-        paired = torch.zeros(self._points, dtype=torch.bool, device=hessian.device)
-        paired[pairs.flatten()] = coupling is not None
-        together = max(1, _PART_POINTS // self._frames)
-        self._parts = [_Part(members, None) for members in (~paired).nonzero().split(together)]
+    def __init__(self, hessian: Tensor, coupling: Tensor | None, next_frame: Tensor, second_frame: Tensor) -> None:
+        self._shape = hessian.shape[2:]
+        first, *second = (expand(member.flatten(2)).permute(0, 3, 1, 2) for member in hessian.unbind(-1))
+        diagonal = first
         if coupling is not None:
-            sticks = zip(pairs.split(together), coupling.split(together, dim=-1), strict=True)
-            self._parts += [_Part(members, between) for members, between in sticks]
-        self._factors: list[BlockTridiagonal] = []
+            between = -expand(coupling.transpose(2, 3).flatten(2)).permute(0, 3, 1, 2)
+            diagonal = torch.cat([torch.cat([first, between], -1), torch.cat([between, second[0]], -1)], -2)
+        by_track = diagonal.unflatten(1, self._shape[:2]).flatten(0, 1)
+        steps = (step.transpose(1, 2).flatten(0, 1).repeat_interleave(3, -1) for step in (next_frame, second_frame))
+        self._factor = BlockTridiagonal(*_two_frames_a_block(by_track, *steps))
 
-    def reductions(self, cross: Tensor, points: Tensor, gradient: Tensor) -> Iterator[tuple[Tensor, Tensor]]:
+    def reductions(self, cross: Tensor, points: Tensor, gradient: Tensor) -> tuple[Tensor, Tensor]:
         """``(L^-1 H_xc)^T`` and ``L^-1 g`` of :class:`PointElimination`, the unknowns in the order of elimination."""
-        self._factors = []
-        for part in self._parts:
-            self._factors.append(self._factor(part))
-            columns = self._columns(part.members)
-            rows = cross_rows(cross[:, :, columns], points[:, columns]).permute(2, 0, 1, 3).flatten(1, 2)
-            rhs = self._blocks(torch.cat([rows, gradient[:, None, columns]], dim=1), part.members)
-            solved = torch.cat([level.flatten(0, -2) for level in self._factors[-1].half_solve(rhs)]).mT
-            yield solved[:-1], solved[-1]
+        rows = cross_rows(cross, points).flatten(1, 2)
+        levels = self._factor.half_solve(self._blocks(torch.cat([rows, gradient[:, None]], dim=1)))
+        solved = torch.cat([level.unflatten(0, (len(rows), -1)).flatten(1, -2) for level in levels], dim=1).mT
+        return solved[:, :-1], solved[:, -1]
 
     def solve(self, rhs: Tensor) -> Tensor:
-        """``H^-1 b`` of a right-hand side (3, N), with the factors of :meth:`reductions` where it has been called."""
-        solution = torch.empty_like(rhs)
-        for part, factor in itertools.zip_longest(self._parts, self._factors):
-            factor = factor or self._factor(part)
-            columns = self._columns(part.members)
-            half = factor.half_solve(self._blocks(rhs[:, None, columns], part.members))
-            tracks = factor.back_solve(half).flatten(1)[:, : 3 * part.members.shape[1] * self._frames]
-            solution[:, columns] = tracks.reshape(-1, 3).mT
-        return solution
+        """``H^-1 b`` of a right-hand side (B, 3, n)."""
+        tracks, frames, points = self._shape
+        solved = self._factor.back_solve(self._factor.half_solve(self._blocks(rhs[:, None])))
+        by_frame = solved.reshape(len(rhs), tracks, -1, points, 3)[:, :, :frames]
+        return by_frame.permute(0, 4, 1, 2, 3).flatten(2)
 
-    def _factor(self, part: _Part) -> BlockTridiagonal:
-        members = part.members
-        first, *second = (expand(self._hessian[..., ends]).permute(3, 2, 0, 1) for ends in members.unbind(1))
-        diagonal = first
-        if part.between is not None:
-            between = -expand(part.between).permute(3, 2, 0, 1)
-            diagonal = torch.cat([torch.cat([first, between], -1), torch.cat([between, second[0]], -1)], -2)
-        steps = (step[:, members].permute(1, 0, 2).repeat_interleave(3, -1) for step in (self._next_frame, self._second_frame))
-        return BlockTridiagonal(*_two_frames_a_block(diagonal, *steps))
-
-    def _columns(self, members: Tensor) -> Tensor:
-        """Columns of the points of tracks (T, q), ordered track, frame, member."""
-        frames = torch.arange(self._frames, device=members.device)[:, None] * self._points
-        return (members[:, None] + frames).flatten()
-
-    def _blocks(self, rhs: Tensor, members: Tensor) -> Tensor:
-        """Right-hand sides (3, k, n) of the tracks' columns as blocks of two frames, (T, G, 6 q, k)."""
-        tracks = rhs.flatten(0, 1).mT.contiguous().view(len(members), self._frames, -1, rhs.shape[1])
-        padded = torch.nn.functional.pad(tracks, (0, 0, 0, 0, 0, 1)) if self._frames % 2 else tracks
+    def _blocks(self, rhs: Tensor) -> Tensor:
+        """Right-hand sides (B, k, 3, n) as blocks of two frames, (B T, G, 6 q, k)."""
+        tracks, frames, points = self._shape
+        by_frame = rhs.unflatten(-1, self._shape).permute(0, 3, 4, 5, 2, 1)
+        by_frame = by_frame.reshape(len(rhs) * tracks, frames, 3 * points, rhs.shape[1])
+        padded = torch.nn.functional.pad(by_frame, (0, 0, 0, 0, 0, frames % 2))
         return padded.unflatten(1, (-1, 2)).flatten(2, 3)
 
 

@@ -1,0 +1,195 @@
+"""Named sets of sessions: lists of specifications, generated one by one."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from torchstickcal.errors import CalibrationError
+from torchstickcal.io.session import Truth
+from torchstickcal.observations import Observations
+from torchstickcal.simulate.clocks import Clocks
+from torchstickcal.simulate.cube import Cube
+from torchstickcal.simulate.motions import ACTIONS
+from torchstickcal.simulate.regimes import (
+    DetectorNoise,
+    Flips,
+    Gaps,
+    GaussianNoise,
+    Noise,
+    Outliers,
+    SelfOcclusion,
+    SwappedEnds,
+)
+from torchstickcal.simulate.rigs import LAYOUTS, Lens
+from torchstickcal.simulate.session import Assumptions, SessionSpec
+
+_PAPER_PATHS = {"golf": "circle", "baseball": "figure8", "hockey": "square", "kendo": "triangle"}
+_PAPER_NOISE_PX = (0.1, 0.2, 0.3, 0.4, 0.5)
+_PAPER_CAMERAS = range(3, 11)
+_PAPER_FPS = 10.0
+_VIDEO = Lens(distortion=(-0.1, 0.02, 0.0005, -0.0005, 0.0))
+
+
+def preset(name: str) -> tuple[SessionSpec, ...]:
+    """The specifications of a named set.
+
+    Raises:
+        CalibrationError: if there is none of that name.
+    """
+    if name not in PRESETS:
+        raise CalibrationError("unknown preset", where="preset", got=repr(name), expected=f"one of {', '.join(PRESETS)}")
+    return PRESETS[name]()
+
+
+def session_specs(name: str, count: int | None = None, seed: int = 0) -> tuple[SessionSpec, ...]:
+    """The first ``count`` sessions of a preset, by default all, or ``count`` of a sport, by default one.
+
+    Args:
+        name: a preset or a sport.
+        count: how many.
+        seed: added to every session's own.
+
+    Raises:
+        CalibrationError: for an unknown name, a count below 1, or a seed below 0.
+    """
+    if name not in PRESETS and name not in ACTIONS:
+        known = f"a preset ({', '.join(PRESETS)}) or a sport ({', '.join(ACTIONS)})"
+        raise CalibrationError("nothing of that name to simulate", where="name", got=repr(name), expected=known)
+    if count is not None and count < 1:
+        raise CalibrationError("no sessions to simulate", where="count", got=count, expected="1 or more")
+    if seed < 0:
+        raise CalibrationError("not a seed", where="seed", got=seed, expected="0 or more")
+    if name in PRESETS:
+        return tuple(replace(spec, seed=spec.seed + seed) for spec in preset(name)[:count])
+    return tuple(everyday(name, seed + number) for number in range(count or 1))
+
+
+def everyday(sport: str, seed: int = 0) -> SessionSpec:
+    """A sport as six cameras and a decent detector see it for some seconds."""
+    return SessionSpec(
+        name=f"{sport}_{seed}",
+        sport=sport,
+        seed=seed,
+        layout="ring",
+        lens=_VIDEO,
+        radius_m=4.5,
+        path="circle",
+        regimes=(DetectorNoise(), SelfOcclusion(), Outliers(0.02), Gaps(0.05)),
+    )
+
+
+def sports_stick_syn(layout: str = "hemisphere") -> tuple[SessionSpec, ...]:
+    """The grid of the paper's data: 4 sports, 5 noise levels, 3 to 10 cameras; 160 sessions with an ArUco cube each."""
+    lens = Lens(image_size=(1200, 1200), focal_px=1600.0)
+    return tuple(
+        SessionSpec(
+            name=f"{path}_{sport}_noise{noise:g}_cam{cameras}" + ("" if layout == "hemisphere" else f"_{layout}"),
+            sport=sport,
+            seed=10_000 * LAYOUTS.index(layout) + 1000 * number + 100 * level + cameras,
+            cameras=cameras,
+            frames=50,
+            fps=_PAPER_FPS,
+            layout=layout,
+            lens=lens,
+            path=path,
+            laps=0.5,
+            regimes=(GaussianNoise(noise),),
+            cube=Cube(),
+        )
+        for number, (sport, path) in enumerate(_PAPER_PATHS.items())
+        for level, noise in enumerate(_PAPER_NOISE_PX)
+        for cameras in _PAPER_CAMERAS
+    )
+
+
+def hard() -> tuple[SessionSpec, ...]:
+    """What detectors make of sports in practice: every sport and the wand on mixed rigs, much of it wrong; 60 sessions."""
+    specs = []
+    for number in range(60):
+        sport = tuple(ACTIONS)[number % len(ACTIONS)]
+        cameras = (2, 3, 4, 5, 6, 8)[number // 5 % 6]
+        layout = LAYOUTS[(number + number // 5) % len(LAYOUTS)]
+        share = number / 59
+        specs.append(
+            SessionSpec(
+                name=f"hard{number:02d}_{sport}_{layout}_cam{cameras}",
+                sport=sport,
+                seed=50_000 + number,
+                cameras=cameras,
+                frames=(60, 120, 180, 240, 300)[(number // 5 + 2 * number) % 5],
+                fps=(30.0, 60.0)[number % 2],
+                layout=layout,
+                lens=_VIDEO,
+                radius_m=4.5,
+                path=("stay", "circle", "figure8", "square", "triangle")[(number // 5 + 3 * number) % 5],
+                height_m=1.62 + 0.3 * ((7 * number) % 60) / 59,
+                regimes=(
+                    DetectorNoise(sigma_px=2.0 + share, stick_sigma_px=1.5),
+                    SelfOcclusion(),
+                    Flips(0.10),
+                    SwappedEnds(0.03),
+                    Outliers(0.10 + 0.05 * share),
+                    Gaps(0.15, mean_frames=4),
+                ),
+            )
+        )
+    return tuple(specs)
+
+
+def regimes() -> tuple[SessionSpec, ...]:
+    """Clocks and lenses: 6 cameras, 300 frames at 30, 60 and 120 Hz; each thing that can be wrong, and several at once."""
+    wrong: dict[str, tuple[Clocks, Assumptions]] = {
+        "right": (Clocks(), Assumptions()),
+        "offsets": (Clocks(offset_s=0.1), Assumptions()),
+        "far_offsets": (Clocks(offset_s=2.0), Assumptions()),
+        "rolling": (Clocks(readout_s=0.015), Assumptions()),
+        "focal": (Clocks(), Assumptions(focal_scale=1.03)),
+        "each_focal": (Clocks(), Assumptions(focal_spread=0.02, centre_px=5.0)),
+        "no_k1": (Clocks(), Assumptions(lens_known=False)),
+        "stick": (Clocks(), Assumptions(stick_scale=1.01)),
+        "all": (Clocks(0.5, 0.015), Assumptions(focal_scale=1.03)),
+    }
+    return tuple(
+        SessionSpec(
+            name=f"{label}_{sport}_{rate}hz",
+            sport=sport,
+            seed=70_000 + rate,
+            frames=300,
+            fps=float(rate),
+            layout="ring",
+            lens=_VIDEO,
+            radius_m=4.5,
+            path="circle",
+            regimes=(DetectorNoise(3.0, 1.5), Gaps(0.15)),
+            clocks=clocks,
+            assumptions=assumptions,
+        )
+        for label, (clocks, assumptions) in wrong.items()
+        for sport, rate in (("golf", 30), ("kendo", 60), ("wand", 120))
+    )
+
+
+PRESETS = {
+    "sports-stick-syn": sports_stick_syn,
+    "sports-stick-syn-random": lambda: sports_stick_syn("random"),
+    "hard": hard,
+    "regimes": regimes,
+}
+
+
+def golf_session(cameras: int = 6, frames: int = 240, noise: Noise | None = None, seed: int = 0) -> tuple[Observations, Truth]:
+    """A right-handed golf swing of 2.4 s seen by cameras on a ring of 4.5 m: a session for demonstrations and tests.
+
+    Args:
+        cameras: number of cameras.
+        frames: number of frames the swing is divided into.
+        noise: what is wrong with the keypoints; None for perfect ones.
+        seed: of everything random.
+    """
+    lens = Lens(focal_px=1200.0, distortion=_VIDEO.distortion)
+    spec = SessionSpec(
+        name="golf", sport="golf", seed=seed, cameras=cameras, frames=frames, fps=(frames - 1) / 2.4, layout="ring", lens=lens,
+        radius_m=4.5, regimes=() if noise is None else (noise,),
+    )  # fmt: skip
+    session = spec.generate()
+    return session.observations, session.truth
