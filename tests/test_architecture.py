@@ -21,8 +21,9 @@ LAYERS = [
     ["assemble"],
     ["pipeline", "metrics", "report", "figures"],
     ["io"],
+    ["simulate", "monitor"],
     ["baselines"],
-    ["simulate", "benchmark", "monitor"],
+    ["benchmark"],
     ["cli"],
 ]
 RANK = {name: rank for rank, names in enumerate(LAYERS) for name in names}

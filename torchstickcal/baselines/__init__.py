@@ -5,25 +5,23 @@ from __future__ import annotations
 from functools import partial
 
 from torchstickcal.baselines.aruco_cube import aruco_cube
-from torchstickcal.baselines.base import BONES, Baseline, Cube, Estimate, Inputs, MissingInputError
+from torchstickcal.baselines.base import BONES, Baseline, Estimate, Inputs, MissingInputError
 from torchstickcal.baselines.calib_person import calib_person
 from torchstickcal.baselines.ewand import ewand
 from torchstickcal.baselines.extra_calib import extra_calib
 from torchstickcal.baselines.human import human_bones, human_height
 from torchstickcal.baselines.kineo import kineo
-from torchstickcal.baselines.simulated_inputs import bone_lengths, cube_views, limb_orientations
+from torchstickcal.baselines.simulated_inputs import bone_lengths, limb_orientations
 from torchstickcal.baselines.stick import stick_only
 
 __all__ = [
     "BASELINES",
     "BONES",
     "Baseline",
-    "Cube",
     "Estimate",
     "Inputs",
     "MissingInputError",
     "bone_lengths",
-    "cube_views",
     "limb_orientations",
 ]
 

@@ -6,7 +6,8 @@ import cv2
 import numpy as np
 import torch
 
-from torchstickcal.baselines.base import Array, Cube, Estimate, Inputs, required
+from torchstickcal.baselines.base import Array, Estimate, Inputs, required
+from torchstickcal.simulate import CubeViews
 
 _MIN_CORNERS = 4
 _FLAT = 1e-6
@@ -28,7 +29,7 @@ def aruco_cube(inputs: Inputs) -> Estimate:
     Raises:
         MissingInputError: if the cube is not given.
     """
-    cube: Cube = required(inputs, "cube")
+    cube: CubeViews = required(inputs, "cube")
     observations = inputs.observations
     rays = observations.cameras.undistort(torch.as_tensor(cube.keypoints, dtype=torch.float64)).numpy()
     rotations, translations = np.full((len(rays), 3, 3), np.nan), np.full((len(rays), 3), np.nan)

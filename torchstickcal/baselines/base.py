@@ -14,7 +14,8 @@ from torchstickcal.errors import CalibrationError
 from torchstickcal.initialise.triangulate import triangulate
 from torchstickcal.observations import Observations
 from torchstickcal.problem import Measurements, State
-from torchstickcal.stages import Ruler, scale_factor
+from torchstickcal.simulate import CubeViews
+from torchstickcal.stages import Ruler, scale_factors
 
 Array = NDArray[np.float64]
 
@@ -35,16 +36,6 @@ class MissingInputError(CalibrationError):
 
 
 @dataclass(frozen=True)
-class Cube:
-    """An ArUco cube in the scene, as the cameras saw it."""
-
-    corners_m: Array
-    """(K, 3) in the cube's own frame, 4 corners per face, faces in order"""
-    keypoints: Array
-    """(C, K, 2), pixels (distorted), NaN where not seen"""
-
-
-@dataclass(frozen=True)
 class Inputs:
     """Everything that some method may use; each takes what it needs."""
 
@@ -53,7 +44,7 @@ class Inputs:
     """the athlete's stature, from the top of the head to the ankles"""
     bone_lengths_m: Mapping[tuple[str, str], float] | None = None
     """lengths of bones by the names of their ends"""
-    cube: Cube | None = None
+    cube: CubeViews | None = None
     orientations: Array | None = None
     """(C, F, B, 3), unit directions of the limbs ``BONES`` in each camera's frame, NaN where not known"""
 
@@ -68,6 +59,11 @@ class Estimate:
     """(C, 3)"""
     status: str
     """``converged``, or one sentence why not"""
+
+    @staticmethod
+    def of(state: State, status: str) -> Estimate:
+        """The cameras of one session's state."""
+        return Estimate(state.rotations[0], state.translations[0], status)
 
 
 Baseline = Callable[[Inputs], Estimate]
@@ -110,14 +106,14 @@ def scaled_by_height(inputs: Inputs, measurements: Measurements, state: State) -
         MissingInputError: if the height is not given.
     """
     top, *ankles = (inputs.observations.point_index(name) for name in ("head_top", "left_ankle", "right_ankle"))
-    ruler = Ruler((top,), tuple(ankles), required(inputs, "height_m"), rigid=False)
-    return state.scaled(scale_factor(measurements, state.points, [ruler]))
+    ruler = Ruler((top,), tuple(ankles), (required(inputs, "height_m"),), rigid=False)
+    return state.scaled(scale_factors(measurements, state.points, [ruler]))
 
 
 def triangulated(measurements: Measurements, rotations: Tensor, translations: Tensor) -> State:
-    """The points of all frames at given poses, zero where fewer than two cameras see them."""
-    rays = measurements.cameras.undistort(measurements.pixels.movedim(1, -1)).movedim(-1, 1)
-    weights = measurements.confidence * rays.isfinite().all(1)
+    """The points of all frames at poses (1, C, 3, 3), (1, C, 3), zero where fewer than two cameras see them."""
+    rays = measurements.cameras[0].undistort(measurements.pixels[0].movedim(1, -1)).movedim(-1, 1)
+    weights = measurements.confidence[0] * rays.isfinite().all(1)
     scale = _TRIANGULATION_RADIUS_PX / float(measurements.cameras.focal_px.mean())
-    points = triangulate(rotations, translations, rays.nan_to_num(), weights, scale=scale)
-    return State(rotations, translations, points.nan_to_num())
+    points = triangulate(rotations[0], translations[0], rays.nan_to_num(), weights, scale=scale)
+    return State(rotations, translations, points.nan_to_num()[None])

@@ -47,7 +47,7 @@ def calib_person(inputs: Inputs) -> Estimate:
     adjusted = adjust(measurements, state, ReprojectionLoss(), _length_variance(measurements, bones))
     state = scaled_by_height(inputs, measurements, adjusted.state)
     status = "converged" if adjusted.converged else "the bundle adjustment stopped before it had converged"
-    return Estimate(state.rotations, state.translations, status)
+    return Estimate.of(state, status)
 
 
 def relative_rotations(orientations: Tensor) -> Tensor:
@@ -74,8 +74,8 @@ def linear_state(measurements: Measurements, rotations: Tensor, bones: Tensor) -
     """
     m = measurements
     cameras, joints = len(rotations), m.points_per_frame
-    rays = m.cameras.undistort(m.pixels.movedim(1, -1))
-    visible = m.by_frame(m.visible & rays.isfinite().all(-1)).movedim(1, 0)
+    rays = m.cameras[0].undistort(m.pixels[0].movedim(1, -1))
+    visible = m.by_frame(m.visible[0] & rays.isfinite().all(-1)).movedim(1, 0)
     rays = m.by_frame(torch.cat([rays, torch.ones_like(rays[..., :1])], dim=-1).nan_to_num().movedim(-1, 0)).permute(2, 1, 3, 0)
 
     # Rows e1 - u e3 and e2 - v e3 of a camera's frame, (F, C, J, 2, 3), vanish on its point; normals (F, C, B, 3) on its limb.
@@ -88,21 +88,21 @@ def linear_state(measurements: Measurements, rotations: Tensor, bones: Tensor) -
     on_limbs = torch.einsum("fcka,cab,ki->fckib", normals, rotations, limbs.to(rays)).flatten(3).flatten(1, 2)
 
     hessian = on_points.mT @ on_points + on_limbs.mT @ on_limbs
-    unseen = ~m.by_frame(m.active).repeat_interleave(3, dim=1)
+    unseen = ~m.by_frame(m.active[0]).repeat_interleave(3, dim=1)
     hessian = hessian + unseen.to(rays).diag_embed()
     cross = on_points.mT @ on_shifts
     response = -torch.linalg.solve(hessian, cross)
     reduced = (on_shifts.mT @ on_shifts + cross.mT @ response).sum(0)
     shifts = torch.linalg.eigh(reduced).eigenvectors[:, 0]
     points = (response @ shifts).view(-1, 3).mT
-    state = State(rotations, torch.cat([shifts.new_zeros(3), shifts]).view(cameras, 3), points)
-    in_front = ((state.in_cameras()[:, 2] > 0) & m.visible).sum()
-    return state if 2 * int(in_front) > int(m.visible.sum()) else state.scaled(-1.0)
+    state = State(rotations[None], torch.cat([shifts.new_zeros(3), shifts]).view(1, cameras, 3), points[None])
+    in_front = ((state.in_cameras()[..., 2, :] > 0) & m.visible).sum()
+    return state.scaled(torch.where(2 * in_front > m.visible.sum(), 1.0, -1.0)[None])
 
 
 def _length_variance(measurements: Measurements, bones: Tensor) -> FrameResiduals:
     """A bone's deviation from its mean length over the session, in logarithms: as a share of it, and blind to the scale."""
-    complete = measurements.by_frame(measurements.active)[:, bones].all(-1)
+    complete = measurements.by_frame(measurements.active[0])[:, bones].all(-1)
 
     def residuals(points: Tensor) -> Tensor:
         limbs = (points[:, bones[:, 1]] - points[:, bones[:, 0]]).where(complete[..., None], 1.0)

@@ -17,7 +17,7 @@ from torchstickcal.initialise import initialise
 from torchstickcal.losses import Huber, ReprojectionLoss
 from torchstickcal.observations import Observations
 from torchstickcal.problem import Measurements
-from torchstickcal.stages import Ruler, scale_factor
+from torchstickcal.stages import Ruler, scale_factors
 
 MIDDLE = "stick_middle"
 _SIGMA_M = 0.001
@@ -44,11 +44,11 @@ def ewand(inputs: Inputs) -> Estimate:
     measurements = Measurements.of(observations, ends | set(middle))
     labels = [observations.camera_label(camera) for camera in range(observations.num_cameras)]
     state = initialise(measurements, InitialiseSettings(), labels)
-    known = [Ruler((stick.start,), (stick.end,), stick.length_m, rigid=True) for stick in observations.sticks]
-    state = state.scaled(scale_factor(measurements, state.points, known))
+    known = [Ruler((stick.start,), (stick.end,), (stick.length_m,), rigid=True) for stick in observations.sticks]
+    state = state.scaled(scale_factors(measurements, state.points, known))
     adjusted = adjust(measurements, state, ReprojectionLoss(kernel=Huber()), _wand(measurements, middle))
     status = "converged" if adjusted.converged else "the bundle adjustment stopped before it had converged"
-    return Estimate(adjusted.state.rotations, adjusted.state.translations, status)
+    return Estimate.of(adjusted.state, status)
 
 
 def _middle(observations: Observations) -> list[int]:
@@ -58,14 +58,14 @@ def _middle(observations: Observations) -> list[int]:
 
 def _wand(measurements: Measurements, middle: list[int]) -> FrameResiduals:
     starts, ends = measurements.pairs.unbind(1)
-    complete = measurements.pair_active
-    with_middle = complete[:, :1] & measurements.by_frame(measurements.active)[:, middle]
+    complete, lengths_m = measurements.pair_active[0], measurements.lengths_m[0]
+    with_middle = complete[:, :1] & measurements.by_frame(measurements.active[0])[:, middle]
 
     def residuals(points: Tensor) -> Tensor:
         along = (points[:, ends] - points[:, starts]).where(complete[..., None], 1.0)
         lengths = along.norm(dim=-1)
         aside = torch.linalg.cross(points[:, middle] - points[:, starts[:1]], along[:, :1] / lengths[:, :1, None], dim=-1)
         aside = (aside * with_middle[..., None]).flatten(1)
-        return torch.cat([(lengths - measurements.lengths_m) * complete, aside], dim=1) / _SIGMA_M
+        return torch.cat([(lengths - lengths_m) * complete, aside], dim=1) / _SIGMA_M
 
     return residuals

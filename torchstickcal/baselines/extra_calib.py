@@ -55,7 +55,7 @@ def extra_calib(inputs: Inputs) -> Estimate:
     state = triangulated(measurements, state.rotations, state.translations)
     state = scaled_by_height(inputs, measurements, state)
     status = f"the adjustment of {unfinished} batches stopped before it had converged" if unfinished else "converged"
-    return Estimate(state.rotations, state.translations, status)
+    return Estimate.of(state, status)
 
 
 def _frames(measurements: Measurements, first: int, last: int) -> Measurements:
@@ -63,9 +63,9 @@ def _frames(measurements: Measurements, first: int, last: int) -> Measurements:
     pixels, confidence = measurements.by_frame(measurements.pixels), measurements.by_frame(measurements.confidence)
     return replace(
         measurements,
-        pixels=pixels[:, :, first:last].flatten(2),
-        confidence=confidence[:, first:last].flatten(1),
-        frames=pixels[:, :, first:last].shape[2],
+        pixels=pixels[..., first:last, :].flatten(-2),
+        confidence=confidence[..., first:last, :].flatten(-2),
+        frames=pixels[..., first:last, :].shape[-2],
     )
 
 

@@ -1,7 +1,7 @@
 """Bundle adjustment with residuals among the points of a frame, and priors of cameras, that the library's solvers do not know.
 
 Levenberg-Marquardt on a dense system. The reprojection comes linearised from the library, a further residual by autograd;
-all points of a frame are eliminated together.
+all points of a frame are eliminated together. One session at a time.
 """
 
 from __future__ import annotations
@@ -18,8 +18,7 @@ from torchstickcal.losses import ReprojectionLoss
 from torchstickcal.objective import Objective
 from torchstickcal.problem import Measurements, State
 from torchstickcal.solvers.cross_blocks import cross_rows
-from torchstickcal.solvers.normal_equations import linearise
-from torchstickcal.symmetric import expand
+from torchstickcal.symmetric import IDENTITY, expand
 
 _INITIAL_DAMPING = 1e-5
 _MIN_DAMPING, _MAX_DAMPING = 1e-12, 1e8
@@ -87,7 +86,7 @@ class _System:
     camera_gradient: Tensor
     """(n,)"""
     cross: Tensor
-    """(F, 3 P, n)"""
+    """(F, 3 P, n), of points with cameras"""
     point_hessian: Tensor
     """(F, 3 P, 3 P)"""
     point_gradient: Tensor
@@ -109,23 +108,30 @@ class _System:
         gradient = torch.linalg.solve_triangular(lower, self.point_gradient[..., None], upper=False)
         points = -torch.linalg.solve_triangular(lower.mT, gradient + (half @ cameras)[..., None], upper=True)[..., 0]
         promised = -float(self.camera_gradient @ cameras + (self.point_gradient * points).sum())
-        return cameras.view(-1, 6), points.reshape(-1, 3).mT, promised
+        return cameras.view(1, -1, 6), points.reshape(1, -1, 3).mT, promised
 
 
 def _linearise(
     objective: Objective, state: State, frame_residuals: FrameResiduals | None, prior: CameraPrior | None
 ) -> _System:
-    system = linearise(objective, state, cameras_free=True)
-    by_frame = objective.measurements.by_frame
-    frames, count = objective.measurements.frames, objective.measurements.points_per_frame
-    hessian = system.points.new_zeros(frames, count, 3, count, 3)
-    hessian.diagonal(dim1=1, dim2=3).copy_(by_frame(expand(system.point_hessian)).permute(2, 0, 1, 3))
-    gradient = by_frame(system.point_gradient).permute(1, 2, 0).flatten(1)
-    camera_hessian = torch.block_diag(*system.camera_hessian)
-    camera_gradient, cost = system.camera_gradient.flatten(), system.cost
+    m, points = objective.measurements, state.points[0]
+    frames, count = m.frames, m.points_per_frame
+    terms = objective.linearise_chunk(state, slice(None))["reprojection"]
+    blocks, slopes = terms.hessian[0], terms.gradient[0]
+    cost = float(terms.cost)
+
+    diagonal = torch.where(m.active[0], blocks.sum(0), points.new_tensor(IDENTITY)[:, None])
+    hessian = points.new_zeros(frames, count, 3, count, 3)
+    hessian.diagonal(dim1=1, dim2=3).copy_(m.by_frame(expand(diagonal)).permute(2, 0, 1, 3))
     hessian = hessian.flatten(3).flatten(1, 2)
+    gradient = m.by_frame(slopes.sum(0)).permute(1, 2, 0).flatten(1)
+    rows = cross_rows(blocks[None, 1:], points[None])[0]
+    cross = m.by_frame(rows.flatten(0, 1)).permute(2, 3, 1, 0).flatten(1, 2)
+    camera_hessian = torch.block_diag(*_by_tangent(rows, points))
+    camera_gradient = _by_tangent(slopes[1:], points).flatten()
+
     if frame_residuals is not None:
-        residuals, jacobian = _differentiate(frame_residuals, by_frame(state.points).permute(1, 2, 0))
+        residuals, jacobian = _differentiate(frame_residuals, m.by_frame(points).permute(1, 2, 0))
         hessian = hessian + jacobian.mT @ jacobian
         gradient = gradient + (jacobian.mT @ residuals[..., None])[..., 0]
         cost += float(residuals.square().sum())
@@ -135,8 +141,12 @@ def _linearise(
         camera_hessian = camera_hessian + torch.block_diag(*prior.information)
         camera_gradient = camera_gradient + slope.flatten()
         cost += float((deviation * slope).sum())
-    cross = by_frame(cross_rows(system.cross, system.points).flatten(0, 1)).permute(2, 3, 1, 0).flatten(1, 2)
     return _System(cost, camera_hessian, camera_gradient, cross, hessian, gradient)
+
+
+def _by_tangent(slopes: Tensor, points: Tensor) -> Tensor:
+    """Derivatives (..., 3, N) by the points as those by a camera's tangent, (..., 6): ``sum B^T g`` with B = [I, -[X]x]."""
+    return torch.cat([slopes.sum(-1), torch.linalg.cross(points.expand_as(slopes), slopes, dim=-2).sum(-1)], dim=-1)
 
 
 def _differentiate(frame_residuals: FrameResiduals, points: Tensor) -> tuple[Tensor, Tensor]:
@@ -151,9 +161,9 @@ def _differentiate(frame_residuals: FrameResiduals, points: Tensor) -> tuple[Ten
 
 def _tangents(prior: CameraPrior, state: State) -> Tensor:
     """Small tangents (C - 1, 6) that lead from the prior's poses to the state's, to first order."""
-    to_world = prior.rotations[1:].mT
-    turn = to_world @ state.rotations[1:]
-    shift = (to_world @ (state.translations[1:] - prior.translations[1:])[..., None])[..., 0]
+    to_world = prior.rotations[0, 1:].mT
+    turn = to_world @ state.rotations[0, 1:]
+    shift = (to_world @ (state.translations[0, 1:] - prior.translations[0, 1:])[..., None])[..., 0]
     return torch.cat([shift, se3.vee(turn)], dim=1)
 
 

@@ -46,14 +46,14 @@ def kineo(inputs: Inputs) -> Estimate:
     rotations = average_rotations(observations.num_cameras, pairs)
     translations = average_translations(rotations, pairs)
 
-    active = measurements.active.nonzero()[:, 0]
-    sample = torch.zeros_like(measurements.active)
+    active = measurements.active[0].nonzero()[:, 0]
+    sample = torch.zeros_like(measurements.active[0])
     sample[active[torch.from_numpy(spread(len(active), _SAMPLED_POINTS))]] = True
     sampled = measurements.keeping(sample)
     objective = Objective(sampled, {"reprojection": ReprojectionLoss(kernel=Huber())})
     outcome = gauss_newton(
         objective,
-        triangulated(sampled, rotations, translations),
+        triangulated(sampled, rotations[None], translations[None]),
         cameras_free=True,
         termination=Termination(),
         stage="sample",
@@ -61,7 +61,8 @@ def kineo(inputs: Inputs) -> Estimate:
     )
     whole = triangulated(measurements, outcome.state.rotations, outcome.state.translations)
     state = scaled_by_height(inputs, measurements, whole)
-    return Estimate(state.rotations, state.translations, "converged" if outcome.stop.converged else str(outcome.stop))
+    stop = outcome.stops[0]
+    return Estimate.of(state, "converged" if stop.converged else str(stop))
 
 
 @dataclass(frozen=True)
