@@ -112,6 +112,8 @@ class Config:
         stages: the minimisations, in order, by name.
         points: which points take part: all, only stick ends, or only joints.
         solver: which solver minimises.
+        precision: of what there is one of per keypoint. The unknowns, and every sum over keypoints, are float64 in any case;
+            ``float32`` halves the memory and suits graphics cards that are slow in float64.
         initialise: the first estimate.
         scale: a length between points, where the scale shall not come from the sticks.
     """
@@ -119,6 +121,7 @@ class Config:
     stages: dict[str, Stage]
     points: Literal["all", "sticks", "joints"] = "all"
     solver: Literal["gauss_newton", "lbfgs"] = "gauss_newton"
+    precision: Literal["float64", "float32"] = "float64"
     initialise: InitialiseSettings = field(default_factory=InitialiseSettings)
     scale: ScaleSettings | None = None
 

@@ -7,6 +7,8 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Protocol
 
+import torch
+
 from torchstickcal.assemble import assemble
 from torchstickcal.config import Config, load_config
 from torchstickcal.initialise import initialise
@@ -52,7 +54,8 @@ def calibrate(
     began = time.perf_counter()
     settings = load_config(config)
     known = rulers([observations], settings)
-    measurements = Measurements.of(observations, _points_used(observations, settings))
+    precision = torch.float32 if settings.precision == "float32" else torch.float64
+    measurements = Measurements.of(observations, _points_used(observations, settings), precision)
     labels = [observations.camera_label(index) for index in range(observations.num_cameras)]
 
     state = initialise(measurements, settings.initialise, labels)

@@ -22,6 +22,8 @@ from torchstickcal.solvers.normal_equations import NormalEquations
 
 _OUTLIER_CUT = 3.5
 _MAD_TO_SIGMA = 1.4826
+_RESOLUTION = {torch.float64: 0.0, torch.float32: 1e-6}
+"""Relative decrease of the cost that can be told from rounding."""
 
 
 @dataclass(frozen=True)
@@ -141,7 +143,7 @@ def run_stage(
         objective,
         state,
         cameras_free=stage.cameras == "free",
-        termination=Termination(stage.max_iterations, stage.cost_tolerance),
+        termination=Termination(stage.max_iterations, max(stage.cost_tolerance, _RESOLUTION[measurements.pixels.dtype])),
         stage=name,
         listener=listener,
     )

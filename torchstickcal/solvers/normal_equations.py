@@ -137,7 +137,7 @@ class NormalEquations:
         response = points.new_empty(len(points), 6 * self._count, *points.shape[1:])
         for part in self._parts:
             cross, elimination = self._eliminated(part)
-            rows = cross_rows(cross, points[..., part.columns]).flatten(1, 2)
+            rows = cross_rows(cross, self._points(part.columns)).flatten(1, 2)
             for row in range(rows.shape[1]):
                 response[:, row][..., part.columns] = -elimination.solve(rows[:, row])
         return response
