@@ -232,8 +232,8 @@ def test_means_stand_next_to_the_papers():
 def test_variances_of_inputs():
     rows = [row(method="human_guessed_low", translation_m=0.001), row(method="human_guessed_high", translation_m=0.003)]
     (line,) = inputs(rows).rows
-    assert line[1:5] == pytest.approx((0.01, 2.0, 0.0, 2.0))
-    assert line[5:] == (0.252, 43.0, 0.102, 22.0)
+    assert line[1:7] == pytest.approx((0.01, 2.0, 0.0, 2.0, 0.0, 2**0.5))
+    assert line[7:] == (0.252, 43.0, 0.102, 22.0)
 
 
 def test_ablation_and_effects():

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from statistics import fmean, median, variance
@@ -101,12 +102,12 @@ def inputs(rows: Sequence[Row]) -> Table:
             paper = INPUTS.get(name)
             scatter = (None, None) if paper is None else (paper.rotation_scatter, _mm(paper.translation_scatter))
             title = "Human, stature - 0.1 m and + 0.1 m" if name == "human_guessed" else _title(name)
-            found.append((title, *_means(of), *_variances(of), *_paper(paper), *scatter))
+            found.append((title, *_means(of), *_variances(of), *_deviations(of), *_paper(paper), *scatter))
     header = (
-        "inputs", "rotation (deg)", "translation (mm)", "variance (deg²)", "variance (mm²)",
-        "paper: rotation (deg)", "paper: translation (mm)", "paper: rot. var.", "paper: trans. var. x 1000",
+        "inputs", "rotation (deg)", "translation (mm)", "variance (deg²)", "variance (mm²)", "std (deg)", "std (mm)",
+        "paper: rotation (deg)", "paper: translation (mm)", "paper: variance (deg)", "paper: variance (mm)",
     )  # fmt: skip
-    note = "What the paper calls variances has the size of standard deviations. " + _reasons(rows, _INPUTS, INPUTS)
+    note = "What the paper calls variances has the size and the unit of standard deviations. " + _reasons(rows, _INPUTS, INPUTS)
     return Table("inputs", "Input variants", header, tuple(found), note)
 
 
@@ -257,6 +258,10 @@ def _variances(rows: Sequence[Row]) -> tuple[float | None, float | None]:
     rotations = [row.rotation_deg for row in rows if row.rotation_deg is not None]
     translations = [1000 * row.translation_m for row in rows if row.translation_m is not None]
     return (variance(rotations), variance(translations)) if len(rotations) > 1 else (None, None)
+
+
+def _deviations(rows: Sequence[Row]) -> tuple[float | None, ...]:
+    return tuple(None if square is None else math.sqrt(square) for square in _variances(rows))
 
 
 def _mean(values: Iterable[float | None]) -> float | None:
