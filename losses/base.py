@@ -75,10 +75,10 @@ class PairTerms(NamedTuple):
 
     cost: Tensor
     """(...): the loss"""
-    residual: Tensor
-    """(..., F, S): weighted residuals"""
-    jacobian: Tensor
-    """(..., 3, F, S): derivative by the pair's second point; by its first point it is the negative"""
+    gradient: Tensor
+    """(..., 3, F, S): half the derivative by the pair's second point; by its first point it is the negative"""
+    hessian: Tensor
+    """(..., 6, F, S): the block by either point, entries xx xy xz yy yz zz; between the two it is the negative"""
 
 
 class TrackTerms(NamedTuple):
@@ -109,7 +109,13 @@ class CameraPointLoss(Loss, ABC):
 
     @abstractmethod
     def linearise(
-        self, points_cam: Tensor, rotations: Tensor, pixels: Tensor, information: Tensor, cameras: Intrinsics
+        self,
+        points_cam: Tensor,
+        rotations: Tensor,
+        pixels: Tensor,
+        information: Tensor,
+        cameras: Intrinsics,
+        exact: bool = False,
     ) -> CameraPointTerms:
         """The terms at N points.
 
@@ -119,6 +125,19 @@ class CameraPointLoss(Loss, ABC):
             pixels: (..., C, 2, N).
             information: confidence / sigma^2, (..., C, N), zero where not seen.
             cameras: the C cameras.
+            exact: whether the blocks are of the exact Hessian, with the curvature of kernel and projection.
+        """
+
+    @abstractmethod
+    def slope(self, points_cam: Tensor, moved_cam: Tensor, pixels: Tensor, information: Tensor, cameras: Intrinsics) -> Tensor:
+        """Half the derivative of the loss where the points move, summed: differentiable by all that is given.
+
+        Args:
+            points_cam: the points in every camera's frame, (..., C, 3, N).
+            moved_cam: how they move, (..., C, 3, N).
+            pixels: (..., C, 2, N).
+            information: confidence / sigma^2, (..., C, N).
+            cameras: the C cameras.
         """
 
 
@@ -126,12 +145,20 @@ class PairLoss(Loss, ABC):
     """Couples two points of one frame through the vector between them."""
 
     @abstractmethod
-    def linearise(self, difference: Tensor, length_m: Tensor, active: Tensor) -> PairTerms:
+    def linearise(self, difference: Tensor, length_m: Tensor, active: Tensor, exact: bool = False) -> PairTerms:
         """Terms at differences (..., 3, F, S) of the pairs' ends, nominal lengths (..., 1, S) and a mask (..., F, S)."""
+
+    @abstractmethod
+    def slope(self, difference: Tensor, moved: Tensor, length_m: Tensor, active: Tensor) -> Tensor:
+        """Half the derivative of the loss where the differences move by (..., 3, F, S), summed; differentiable."""
 
 
 class TrackLoss(Loss, ABC):
     """Couples three consecutive frames of one point through their second difference."""
+
+    @abstractmethod
+    def slope(self, points: Tensor, moved: Tensor, active: Tensor) -> Tensor:
+        """Half the derivative of the loss where the points move by (..., 3, F, P), summed; differentiable."""
 
     @abstractmethod
     def linearise(self, points: Tensor, active: Tensor) -> TrackTerms:

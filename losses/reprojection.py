@@ -7,6 +7,7 @@ from torch import Tensor
 
 from torchstickcal.cameras import Intrinsics, inverse_depths
 from torchstickcal.losses.base import CameraPointLoss, CameraPointTerms
+from torchstickcal.symmetric import symmetric_product
 
 
 def reprojection_residuals(
@@ -55,7 +56,13 @@ class ReprojectionLoss(CameraPointLoss):
         return self.total(squared if confidence is None else squared * confidence)
 
     def linearise(
-        self, points_cam: Tensor, rotations: Tensor, pixels: Tensor, information: Tensor, cameras: Intrinsics
+        self,
+        points_cam: Tensor,
+        rotations: Tensor,
+        pixels: Tensor,
+        information: Tensor,
+        cameras: Intrinsics,
+        exact: bool = False,
     ) -> CameraPointTerms:
         # The derivative of (u, v) by the world point has the rows p / z and q / z, p = r1 - u r3 and q = r2 - v r3 with the
         # rows r of the rotation; M, the derivative of the pixel by (u, v), gives J^T W J = [p q] (M^T W M / z^2) [p q]^T.
@@ -77,16 +84,26 @@ class ReprojectionLoss(CameraPointLoss):
         gradient.addcmul_(q, _scaled(weights, m.dx_dv, rx, m.dy_dv, ry, inverse_depth))
 
         weights_at_depth = weights * inverse_depth.square()
+        pp = _scaled(weights_at_depth, m.dx_du, m.dx_du, m.dy_du, m.dy_du)
         pq = _scaled(weights_at_depth, m.dx_du, m.dx_dv, m.dy_du, m.dy_dv)
-        s = p * _scaled(weights_at_depth, m.dx_du, m.dx_du, m.dy_du, m.dy_du)
-        t = p * pq
+        qq = _scaled(weights_at_depth, m.dx_dv, m.dx_dv, m.dy_dv, m.dy_dv)
+        if exact:
+            bend = 2 * self.weight * (information * inverse_depth).square() * self.kernel.curvature(squared)
+            along_u, along_v = m.dx_du * rx + m.dy_du * ry, m.dx_dv * rx + m.dy_dv * ry
+            uu, uv, vv = cameras.pixel_curvature(u, v, weights_at_depth * rx, weights_at_depth * ry)
+            pp = pp + (bend * along_u * along_u + uu).unsqueeze(-2)
+            pq = pq + (bend * along_u * along_v + uv).unsqueeze(-2)
+            qq = qq + (bend * along_v * along_v + vv).unsqueeze(-2)
+        s, t = p * pp, p * pq
         s.addcmul_(q, pq)
-        t.addcmul_(q, _scaled(weights_at_depth, m.dx_dv, m.dx_dv, m.dy_dv, m.dy_dv))
+        t.addcmul_(q, qq)
         hessian = p.new_empty(*p.shape[:-2], 6, p.shape[-1])
         for entries, axis in ((slice(0, 3), 0), (slice(3, 5), 1), (slice(5, 6), 2)):
             block = hessian[..., entries, :]
             torch.mul(p[..., axis : axis + 1, :], s[..., axis:, :], out=block)
             block.addcmul_(q[..., axis : axis + 1, :], t[..., axis:, :])
+        if exact:
+            hessian -= symmetric_product(third.expand_as(p), gradient * inverse_depth.unsqueeze(-2))
         return CameraPointTerms(
             cost=self.total(squared, over=2),
             squares=(weights * squared_px).sum(-1),
@@ -94,6 +111,17 @@ class ReprojectionLoss(CameraPointLoss):
             gradient=gradient,
             hessian=hessian,
         )
+
+    def slope(self, points_cam: Tensor, moved_cam: Tensor, pixels: Tensor, information: Tensor, cameras: Intrinsics) -> Tensor:
+        x, y, z = points_cam.unbind(-2)
+        dx, dy, dz = moved_cam.unbind(-2)
+        inverse_depth = inverse_depths(z)
+        u, v = x * inverse_depth, y * inverse_depth
+        du, dv = (dx - u * dz) * inverse_depth, (dy - v * dz) * inverse_depth
+        m = cameras.pixels_with_jacobian(u, v)
+        rx, ry = m.x - pixels[..., 0, :], m.y - pixels[..., 1, :]
+        weights = self.weight * information * self.kernel.weight((rx.square() + ry.square()) * information)
+        return (weights * (rx * (m.dx_du * du + m.dx_dv * dv) + ry * (m.dy_du * du + m.dy_dv * dv))).sum()
 
 
 def _scaled(weights: Tensor, a: Tensor, b: Tensor, c: Tensor, d: Tensor, factor: Tensor | None = None) -> Tensor:

@@ -25,6 +25,10 @@ class RobustKernel(Protocol):
         """The derivative rho'(s), in (0, 1]."""
         ...
 
+    def curvature(self, squared: Tensor) -> Tensor:
+        """The second derivative rho''(s), not above 0."""
+        ...
+
 
 @dataclass(frozen=True)
 class Quadratic:
@@ -35,6 +39,9 @@ class Quadratic:
 
     def weight(self, squared: Tensor) -> Tensor:
         return squared.new_ones(()).expand_as(squared)
+
+    def curvature(self, squared: Tensor) -> Tensor:
+        return squared.new_zeros(()).expand_as(squared)
 
 
 @dataclass(frozen=True)
@@ -48,6 +55,9 @@ class Cauchy:
 
     def weight(self, squared: Tensor) -> Tensor:
         return (1 + squared / self.scale**2).reciprocal()
+
+    def curvature(self, squared: Tensor) -> Tensor:
+        return -((self.scale + squared / self.scale).square().reciprocal())
 
 
 @dataclass(frozen=True)
@@ -63,6 +73,10 @@ class Huber:
     def weight(self, squared: Tensor) -> Tensor:
         return self.scale * squared.clamp_min(self.scale**2).rsqrt()
 
+    def curvature(self, squared: Tensor) -> Tensor:
+        linear = -0.5 * self.scale * squared.clamp_min(self.scale**2).pow(-1.5)
+        return linear.where(squared > self.scale**2, 0.0)
+
 
 @dataclass(frozen=True)
 class GemanMcClure:
@@ -75,6 +89,9 @@ class GemanMcClure:
 
     def weight(self, squared: Tensor) -> Tensor:
         return (1 + squared / self.scale**2).square().reciprocal()
+
+    def curvature(self, squared: Tensor) -> Tensor:
+        return -2 / self.scale**2 * (1 + squared / self.scale**2).pow(-3)
 
 
 _KERNELS = {"none": Quadratic, "cauchy": Cauchy, "huber": Huber, "geman_mcclure": GemanMcClure}

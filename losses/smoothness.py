@@ -46,3 +46,10 @@ class SmoothnessLoss(TrackLoss):
         squared = difference.square().sum(-3) * self.information(difference)
         scale = (self.weight * self.information(difference) * self.kernel.weight(squared)).sqrt() * complete
         return TrackTerms(cost=self.total(squared, over=2), residual=difference * scale.unsqueeze(-3), scale=scale)
+
+    def slope(self, points: Tensor, moved: Tensor, active: Tensor) -> Tensor:
+        complete = complete_triples(active)
+        difference = stencil(points, dim=-2) * complete.unsqueeze(-3)
+        squared = difference.square().sum(-3) * self.information(difference)
+        weights = self.weight * self.information(difference) * self.kernel.weight(squared)
+        return (weights * (difference * stencil(moved, dim=-2)).sum(-3)).sum()

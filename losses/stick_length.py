@@ -6,6 +6,7 @@ import torch
 from torch import Tensor
 
 from torchstickcal.losses.base import PairLoss, PairTerms
+from torchstickcal.symmetric import DIAGONAL, outer
 
 _MIN_LENGTH_M = 1e-6
 
@@ -31,16 +32,32 @@ class StickLengthLoss(PairLoss):
         residuals = torch.where(known, lengths - length_m, torch.zeros_like(lengths))
         return self.total(residuals.square() * self.information(residuals))
 
-    def linearise(self, difference: Tensor, length_m: Tensor, active: Tensor) -> PairTerms:
+    def linearise(self, difference: Tensor, length_m: Tensor, active: Tensor, exact: bool = False) -> PairTerms:
         length = _length(difference, dim=-3)
-        residual = (length - length_m) * active
-        squared = residual.square() * self.information(residual)
-        scale = (self.weight * self.information(residual) * self.kernel.weight(squared)).sqrt() * active
+        information = self.information(length) * active
+        residual = length - length_m
+        squared = residual.square() * information
+        weights = self.weight * information * self.kernel.weight(squared)
+        along, across = weights, torch.zeros_like(weights)
+        if exact:
+            along = along + 2 * self.weight * information * self.kernel.curvature(squared) * squared
+            across = weights * residual / length
+        direction = difference / length.unsqueeze(-3)
+        hessian = outer(direction.flatten(-2)).unflatten(-1, length.shape[-2:]) * (along - across).unsqueeze(-3)
+        for entry in DIAGONAL:
+            hessian[..., entry, :, :] += across
         return PairTerms(
             cost=self.total(squared, over=2),
-            residual=residual * scale,
-            jacobian=difference * (scale / length).unsqueeze(-3),
+            gradient=direction * (weights * residual).unsqueeze(-3),
+            hessian=hessian,
         )
+
+    def slope(self, difference: Tensor, moved: Tensor, length_m: Tensor, active: Tensor) -> Tensor:
+        length = _length(difference, dim=-3)
+        information = self.information(length) * active
+        residual = length - length_m
+        weights = self.weight * information * self.kernel.weight(residual.square() * information)
+        return (weights * residual * (difference * moved).sum(-3) / length).sum()
 
 
 def _length(difference: Tensor, dim: int) -> Tensor:

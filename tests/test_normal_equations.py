@@ -2,11 +2,22 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import pytest
 import torch
 from kornia.geometry.liegroup import Se3
 
-from torchstickcal.losses import Cauchy, Loss, ReprojectionLoss, SmoothnessLoss, StickLengthLoss, second_differences
+from torchstickcal.losses import (
+    Cauchy,
+    GemanMcClure,
+    Huber,
+    Loss,
+    ReprojectionLoss,
+    SmoothnessLoss,
+    StickLengthLoss,
+    second_differences,
+)
 from torchstickcal.losses.reprojection import reprojection_residuals
 from torchstickcal.objective import Objective
 from torchstickcal.problem import Measurements, State
@@ -67,18 +78,7 @@ def dense_system(objective: Objective, state: State) -> tuple[torch.Tensor, torc
 @pytest.mark.parametrize("losses", LOSSES.values(), ids=LOSSES.keys())
 @pytest.mark.parametrize("damping", [0.0, 1e-3])
 def test_step_is_that_of_the_full_system(disturbed: tuple[Measurements, State], losses: dict[str, Loss], damping: float):
-    measurements, state = disturbed
-    frames, points = 6, measurements.points_per_frame
-    columns = slice(0, frames * points)
-    measurements = Measurements(
-        measurements.pixels[..., columns].contiguous(),
-        measurements.confidence[..., columns].contiguous(),
-        measurements.cameras,
-        frames,
-        measurements.pairs,
-        measurements.lengths_m,
-    )
-    state = State(state.rotations, state.translations, state.points[..., columns].contiguous())
+    measurements, state = first_frames(*disturbed, frames=6)
     objective = Objective(measurements, losses)
     hessian, gradient, cost = dense_system(objective, state)
     inactive = (~measurements.active[0]).repeat_interleave(3).nonzero().flatten() + 18
@@ -102,6 +102,62 @@ def test_step_is_that_of_the_full_system(disturbed: tuple[Measurements, State], 
     h_cc, h_cx, h_xx = damped[:cameras, :cameras], damped[:cameras, cameras:], damped[cameras:, cameras:]
     reduced = h_cc - h_cx @ torch.linalg.solve(h_xx, h_cx.mT)
     torch.testing.assert_close(system.reduced[0], reduced, rtol=1e-8, atol=1e-10 * float(reduced.abs().max()))
+
+
+def first_frames(measurements: Measurements, state: State, frames: int) -> tuple[Measurements, State]:
+    columns = slice(0, frames * measurements.points_per_frame)
+    pixels, confidence = measurements.pixels[..., columns].contiguous(), measurements.confidence[..., columns].contiguous()
+    measurements = dataclasses.replace(measurements, pixels=pixels, confidence=confidence, frames=frames)
+    return measurements, dataclasses.replace(state, points=state.points[..., columns].contiguous())
+
+
+EXACT: dict[str, dict[str, Loss]] = {
+    "cauchy": {"reprojection": ReprojectionLoss(9.0, 0.7, Cauchy(5.0)), "length": StickLengthLoss(0.1, 0.4, Cauchy(2.0))},
+    "geman": {"reprojection": ReprojectionLoss(9.0, kernel=GemanMcClure(8.0)), "length": StickLengthLoss(0.1)},
+    "huber": {"reprojection": ReprojectionLoss(2.0, kernel=Huber(1.5)), "length": StickLengthLoss(0.01)},
+    "smooth": {
+        "reprojection": ReprojectionLoss(2.0),
+        "length": StickLengthLoss(0.01),
+        "smoothness": SmoothnessLoss(0.05, weight=0.2),
+    },
+}
+
+
+@pytest.mark.parametrize("losses", EXACT.values(), ids=EXACT.keys())
+def test_exact_hessian_is_autograds(disturbed: tuple[Measurements, State], losses: dict[str, Loss]):
+    """At a state that is no minimum, with distorted lenses: all terms of the second derivative take part."""
+    measurements, state = first_frames(*disturbed, frames=5)
+    objective = Objective(measurements, losses)
+    shape = (1, measurements.frames, measurements.points_per_frame, 3)
+
+    def value(unknowns: torch.Tensor) -> torch.Tensor:
+        step = Se3.exp(unknowns[:18].view(3, 6)).matrix()
+        turned = torch.cat([state.rotations[:, :1], state.rotations[:, 1:] @ step[None, :, :3, :3]], dim=1)
+        moved = (state.rotations[:, 1:] @ step[None, :, :3, 3:])[..., 0] + state.translations[:, 1:]
+        points = state.points + unknowns[18:].view(-1, 3).mT
+        translations = torch.cat([state.translations[:, :1], moved], dim=1)
+        return torch.stack(list(objective.terms(turned, translations, points[0].mT.reshape(shape)).values())).sum() / 2
+
+    zero = torch.zeros(18 + state.points.numel(), dtype=torch.float64)
+    hessian = torch.autograd.functional.hessian(value, zero)
+    inactive = (~measurements.active[0]).repeat_interleave(3).nonzero().flatten() + 18
+    hessian[inactive, inactive] += 1.0
+    rhs = torch.randn(len(zero), generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+
+    def solved(damping: float) -> torch.Tensor:
+        system = NormalEquations(objective, state, True, damping, exact=True)
+        cameras, points, _ = system.solve(rhs[:18].view(1, 3, 6), rhs[18:].view(1, -1, 3).mT)
+        return torch.cat([cameras.flatten(), points[0].mT.flatten()])
+
+    damping = 0.5  # makes it definite away from the minimum
+    damped = hessian + damping * torch.diag(hessian.diagonal())
+    torch.testing.assert_close(damped @ solved(damping), rhs, rtol=1e-8, atol=1e-8)
+
+    direction = 0.01 * torch.randn(len(zero), generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+    steps = torch.cat([torch.zeros(1, 6), direction[:18].view(3, 6)])[None], direction[18:].view(1, -1, 3).mT
+    (gradient,) = torch.autograd.grad(value(zero.requires_grad_()), zero)
+    along = float(objective.slope(state, *steps))
+    assert along == pytest.approx(float(gradient @ direction), rel=1e-10)
 
 
 @pytest.mark.parametrize("losses", LOSSES.values(), ids=LOSSES.keys())

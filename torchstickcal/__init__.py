@@ -14,6 +14,8 @@ if TYPE_CHECKING:
     from torchstickcal.config import Config, config_names, load_config
     from torchstickcal.errors import CalibrationError, ConfigError, FileFormatError, ObservationError, RigError
     from torchstickcal.extrinsics import Extrinsics
+    from torchstickcal.gradients import GaussNewton, GradientMode, Implicit, Unrolled
+    from torchstickcal.layer import CalibrationLayer, LayerResult
     from torchstickcal.monitor import TensorBoardMonitor
     from torchstickcal.observations import Observations, Stick
     from torchstickcal.pipeline import Callback, calibrate
@@ -24,17 +26,23 @@ __version__ = version("torchstickcal")
 _HOMES = {
     "Calibration": "result",
     "CalibrationError": "errors",
+    "CalibrationLayer": "layer",
     "Callback": "pipeline",
     "Config": "config",
     "ConfigError": "errors",
     "Extrinsics": "extrinsics",
     "FileFormatError": "errors",
+    "GaussNewton": "gradients",
+    "GradientMode": "gradients",
+    "Implicit": "gradients",
     "Intrinsics": "cameras",
+    "LayerResult": "layer",
     "ObservationError": "errors",
     "Observations": "observations",
     "RigError": "errors",
     "Stick": "observations",
     "TensorBoardMonitor": "monitor",
+    "Unrolled": "gradients",
     "calibrate": "pipeline",
     "config_names": "config",
     "load_config": "config",
@@ -44,17 +52,23 @@ _SUBPACKAGES = {"io", "losses", "metrics", "simulate"}
 __all__ = [
     "Calibration",
     "CalibrationError",
+    "CalibrationLayer",
     "Callback",
     "Config",
     "ConfigError",
     "Extrinsics",
     "FileFormatError",
+    "GaussNewton",
+    "GradientMode",
+    "Implicit",
     "Intrinsics",
+    "LayerResult",
     "ObservationError",
     "Observations",
     "RigError",
     "Stick",
     "TensorBoardMonitor",
+    "Unrolled",
     "calibrate",
     "config_names",
     "load_config",

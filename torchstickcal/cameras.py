@@ -97,6 +97,19 @@ class Intrinsics:
             dy_dv=fy * lens.dv_dv,
         )
 
+    def pixel_curvature(self, u: Tensor, v: Tensor, along_x: Tensor, along_y: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Second derivatives uu, uv, vv of ``along_x x + along_y y``, pixels (x, y) of normalised coordinates (..., C, N)."""
+        if self.distortion is None:
+            zero = torch.zeros_like(u)
+            return zero, zero, zero
+        with torch.enable_grad():
+            u, v = u.detach().requires_grad_(), v.detach().requires_grad_()
+            m = self.pixels_with_jacobian(u, v)
+            by_u, by_v = along_x * m.dx_du + along_y * m.dy_du, along_x * m.dx_dv + along_y * m.dy_dv
+            uu, uv = torch.autograd.grad(by_u.sum(), (u, v), retain_graph=True)
+            (vv,) = torch.autograd.grad(by_v.sum(), v)
+        return uu, uv, vv
+
     def distort(self, u: Tensor, v: Tensor) -> tuple[Tensor, Tensor]:
         """Apply the lenses to normalised coordinates, two tensors (..., C, ...)."""
         if self.distortion is None:

@@ -12,6 +12,7 @@ from typing import TypeVar
 import torch
 from torch import Tensor
 
+from torchstickcal import se3
 from torchstickcal.losses import CameraPointLoss, Loss, PairLoss, TrackLoss
 from torchstickcal.losses.base import CameraPointTerms, PairTerms, TrackTerms
 from torchstickcal.problem import Columns, Measurements, State
@@ -66,26 +67,46 @@ class Objective:
             values[name] = loss(points)
         return values
 
-    def linearise_chunk(self, state: State, columns: Columns) -> dict[str, CameraPointTerms]:
+    def slope(self, state: State, camera_step: Tensor, point_step: Tensor) -> Tensor:
+        """Half the derivative of the objective along a step from a state, differentiable by measurements and state.
+
+        Args:
+            state: where.
+            camera_step: (B, C, 6), tangents.
+            point_step: (B, 3, N).
+        """
+        m = self.measurements
+        moved = point_step[:, None] + se3.moved(se3.hat(camera_step[..., 3:]), camera_step[..., :3], state.points)
+        points_cam, moved_cam = state.in_cameras(), state.rotations @ moved
+        total = points_cam.new_zeros(())
+        for name, loss in self._camera_point.items():
+            total = total + loss.slope(points_cam, moved_cam, m.pixels, m.confidence * self._information[name], m.cameras)
+        for loss in self._pair.values():
+            difference, moved_ends = self._differences(state.points), self._differences(point_step)
+            total = total + loss.slope(difference, moved_ends, m.lengths_m[:, None], m.pair_active)
+        for loss in self._track.values():
+            total = total + loss.slope(m.by_frame(state.points), m.by_frame(point_step), m.by_frame(m.active))
+        return total
+
+    def linearise_chunk(self, state: State, columns: Columns, exact: bool = False) -> dict[str, CameraPointTerms]:
         """The camera-point losses, linearised at some of the columns N."""
         m = self.measurements
         pixels, confidence = m.pixels[..., columns], m.confidence[..., columns]
         points_cam, rotations = state.in_cameras(columns, pixels.dtype), state.rotations.to(pixels.dtype)
         return {
             name: loss.linearise(
-                points_cam, rotations, pixels, confidence * self._information[name][..., columns], m.cameras_in_dtype
+                points_cam, rotations, pixels, confidence * self._information[name][..., columns], m.cameras_in_dtype, exact
             )
             for name, loss in self._camera_point.items()
         }
 
-    def linearise_pairs(self, state: State) -> dict[str, PairTerms]:
+    def linearise_pairs(self, state: State, exact: bool = False) -> dict[str, PairTerms]:
         """The pair losses, linearised."""
         if not self._pair:
             return {}
         m = self.measurements
-        ends = m.by_frame(state.points)[..., m.pairs]
-        difference = ends[..., 1] - ends[..., 0]
-        return {name: loss.linearise(difference, m.lengths_m[:, None], m.pair_active) for name, loss in self._pair.items()}
+        arguments = self._differences(state.points), m.lengths_m[:, None], m.pair_active, exact
+        return {name: loss.linearise(*arguments) for name, loss in self._pair.items()}
 
     def linearise_tracks(self, state: State) -> dict[str, TrackTerms]:
         """The track losses, linearised."""
@@ -94,6 +115,11 @@ class Objective:
         m = self.measurements
         active = m.by_frame(m.active)
         return {name: loss.linearise(m.by_frame(state.points), active) for name, loss in self._track.items()}
+
+    def _differences(self, points: Tensor) -> Tensor:
+        """From one end of every stick to the other, (B, 3, F, S), of points (B, 3, N)."""
+        ends = self.measurements.by_frame(points)[..., self.measurements.pairs]
+        return ends[..., 1] - ends[..., 0]
 
     def _of_kind(self, kind: type[_Kind]) -> dict[str, _Kind]:
         return {name: loss for name, loss in self.losses.items() if isinstance(loss, kind)}

@@ -55,7 +55,7 @@ def calibrate(
     settings = load_config(config)
     known = rulers([observations], settings)
     precision = torch.float32 if settings.precision == "float32" else torch.float64
-    measurements = Measurements.of(observations, _points_used(observations, settings), precision)
+    measurements = Measurements.of(observations, points_used(observations, settings), precision)
     labels = [observations.camera_label(index) for index in range(observations.num_cameras)]
 
     state = initialise(measurements, settings.initialise, labels)
@@ -78,7 +78,7 @@ def calibrate(
     return calibration
 
 
-def _points_used(observations: Observations, config: Config) -> list[int] | None:
+def points_used(observations: Observations, config: Config) -> list[int] | None:
     """The points that take part; None for all."""
     ends = {end for stick in observations.sticks for end in (stick.start, stick.end)}
     if config.points == "sticks":

@@ -80,9 +80,10 @@ class Measurements:
             return sessions[0]
         first = sessions[0]
         lenses = [session.cameras.distortion for session in sessions]
+        some = next((lens for lens in lenses if lens is not None), None)
         cameras = Intrinsics(
             torch.cat([session.cameras.matrix for session in sessions]),
-            None if lenses[0] is None else torch.cat([lens for lens in lenses if lens is not None]),
+            None if some is None else torch.cat([torch.zeros_like(some) if lens is None else lens for lens in lenses]),
             first.cameras.fisheye,
         )
         pixels, confidence, lengths_m = (

@@ -45,8 +45,8 @@ class Ruler:
 
     start: tuple[int, ...]
     end: tuple[int, ...]
-    lengths_m: tuple[float, ...]
-    """one for each session"""
+    lengths_m: Tensor
+    """(B,), one for each session"""
     rigid: bool
 
     def measured_m(self, measurements: Measurements, points: Tensor) -> Tensor:
@@ -54,7 +54,8 @@ class Ruler:
         by_frame, active = measurements.by_frame(points), measurements.by_frame(measurements.active)
         start, end = list(self.start), list(self.end)
         vectors = by_frame[..., end].mean(-1) - by_frame[..., start].mean(-1)
-        return vectors.square().sum(1).sqrt().where(active[..., start + end].all(-1), torch.nan)
+        known = active[..., start + end].all(-1)
+        return vectors.square().sum(1).where(known, 1.0).sqrt().where(known, torch.nan)
 
 
 def rulers(sessions: Sequence[Observations], config: Config) -> list[Ruler]:
@@ -67,12 +68,16 @@ def rulers(sessions: Sequence[Observations], config: Config) -> list[Ruler]:
     observations = sessions[0]
     if config.scale is not None:
         start, end = (tuple(map(observations.point_index, names)) for names in (config.scale.start, config.scale.end))
-        return [Ruler(start, end, (config.scale.length_m,) * len(sessions), rigid=False)]
+        return [Ruler(start, end, _lengths([config.scale.length_m] * len(sessions), observations), rigid=False)]
     if observations.sticks and config.points != "joints":
-        lengths_m = zip(*([stick.length_m for stick in session.sticks] for session in sessions), strict=True)
         return [
-            Ruler((stick.start,), (stick.end,), lengths, rigid=True)
-            for stick, lengths in zip(observations.sticks, lengths_m, strict=True)
+            Ruler(
+                (stick.start,),
+                (stick.end,),
+                _lengths([session.sticks[number].length_m for session in sessions], observations),
+                rigid=True,
+            )
+            for number, stick in enumerate(observations.sticks)
         ]
     raise ConfigError(
         "nothing sets the scale",
@@ -80,6 +85,10 @@ def rulers(sessions: Sequence[Observations], config: Config) -> list[Ruler]:
         got=f"{len(observations.sticks)} sticks, points = {config.points!r}",
         expected="a stick among the points that take part, or a [scale] table with a known length",
     )
+
+
+def _lengths(lengths_m: list[float], observations: Observations) -> Tensor:
+    return torch.tensor(lengths_m, dtype=torch.float64, device=observations.keypoints.device)
 
 
 def scale_factors(measurements: Measurements, points: Tensor, known: Sequence[Ruler]) -> Tensor:
@@ -97,7 +106,7 @@ def scale_factors(measurements: Measurements, points: Tensor, known: Sequence[Ru
             limit = _OUTLIER_CUT * _MAD_TO_SIGMA * deviation.nanmedian(1, keepdim=True).values + 1e-12 * median
             lengths = lengths.where(deviation <= limit, torch.nan)
         measured += lengths.nansum(1)
-        expected += points.new_tensor(ruler.lengths_m) * lengths.isfinite().sum(1)
+        expected += ruler.lengths_m * lengths.isfinite().sum(1)
     if not bool((measured > 0).all()):
         raise ObservationError(
             "the length that sets the scale is never seen whole",
@@ -112,6 +121,9 @@ class StageResult(NamedTuple):
     """Where a stage ended: the state, which keypoints took part, their noise before it, and its records."""
 
     state: State
+    minimum: State
+    """the state before the scene was brought to scale, where the stage does so"""
+    losses: dict[str, Loss]
     inliers: Tensor
     """(B, C, N)"""
     sigma_px: Tensor
@@ -147,13 +159,13 @@ def run_stage(
         stage=name,
         listener=listener,
     )
-    state = outcome.state
+    state = minimum = outcome.state
     if stage.rescale:
-        state = state.scaled(scale_factors(measurements, state.points, known))
+        state = minimum.scaled(scale_factors(measurements, minimum.points, known))
     seconds = time.perf_counter() - began
     ended = zip(outcome.stops, outcome.iterations, strict=True)
     records = tuple(StageRecord(name, stop, seconds, iterations) for stop, iterations in ended)
-    return StageResult(state, measurements.visible, sigma_px, records)
+    return StageResult(state, minimum, objective.losses, measurements.visible, sigma_px, records)
 
 
 def _losses(stage: Stage, measurements: Measurements, state: State, sigma_px: Tensor) -> dict[str, Loss]:

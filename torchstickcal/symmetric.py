@@ -30,6 +30,12 @@ def outer(vectors: Tensor) -> Tensor:
     return torch.stack([x * x, x * y, x * z, y * y, y * z, z * z], dim=-2)
 
 
+def symmetric_product(a: Tensor, b: Tensor) -> Tensor:
+    """The six entries (..., 6, N) of a b^T + b a^T for vectors (..., 3, N)."""
+    pairs = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
+    return torch.stack([a[..., i, :] * b[..., j, :] + a[..., j, :] * b[..., i, :] for i, j in pairs], dim=-2)
+
+
 def gram(matrices: Tensor) -> Tensor:
     """The six entries (..., 6, N) of A^T A, for matrices stored as (..., column, row, N)."""
     a, b, c = matrices.unbind(-3)

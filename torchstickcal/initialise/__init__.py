@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from functools import partial
 
 import torch
+from torch import Tensor
 
 from torchstickcal.config import InitialiseSettings
 from torchstickcal.initialise.graph import propagate, spanning_tree
@@ -14,8 +15,7 @@ from torchstickcal.initialise.triangulate import triangulate
 from torchstickcal.initialise.views import Views
 from torchstickcal.problem import Measurements, State
 
-__all__ = ["initialise"]
-
+__all__ = ["initialise", "triangulated"]
 
 _SUPPORT_RADIUS = 10.0
 
@@ -34,13 +34,25 @@ def initialise(measurements: Measurements, settings: InitialiseSettings, labels:
     views = Views(measurements)
     find = partial(relate, views, max_points=settings.max_points, threshold_px=settings.threshold_px)
     edges = spanning_tree(views.common(), find, labels, settings.min_common_points)
-    scale = _SUPPORT_RADIUS * settings.threshold_px / float(measurements.cameras.focal_px.mean())
+    scale = _scale(measurements, settings)
     poses = propagate(edges, views, scale)
-    rotations, translations = (torch.from_numpy(pose).to(measurements.pixels.device) for pose in poses)
-    points = rotations.new_zeros(3, measurements.num_columns)
+    rotations, translations = (torch.from_numpy(pose)[None].to(measurements.pixels.device) for pose in poses)
+    return State(rotations, translations, triangulated(measurements, rotations, translations, settings))
+
+
+def triangulated(measurements: Measurements, rotations: Tensor, translations: Tensor, settings: InitialiseSettings) -> Tensor:
+    """The points (1, 3, N) of one session at poses (1, C, 3, 3), (1, C, 3); zero where fewer than two cameras see them."""
+    scale = _scale(measurements, settings)
+    points = rotations.new_zeros(1, 3, measurements.num_columns)
     for columns in measurements.chunks():
         pixels = measurements.pixels[0][..., columns].double().movedim(1, -1)
         rays = measurements.cameras[0].undistort(pixels).movedim(-1, 1)
         weights = measurements.confidence[0][:, columns].double() * rays.isfinite().all(1)
-        points[:, columns] = triangulate(rotations, translations, rays.nan_to_num(), weights, scale=scale).nan_to_num()
-    return State(rotations[None], translations[None], points[None])
+        found = triangulate(rotations[0], translations[0], rays.nan_to_num(), weights, scale=scale)
+        points[0, :, columns] = found.nan_to_num()
+    return points
+
+
+def _scale(measurements: Measurements, settings: InitialiseSettings) -> float:
+    """Residual, in normalised coordinates, up to which a keypoint supports a pose."""
+    return _SUPPORT_RADIUS * settings.threshold_px / float(measurements.cameras.focal_px.mean())

@@ -29,6 +29,16 @@ def add_rotations(rows: Tensor, points: Tensor) -> None:
     torch.mul(b, x, out=rows[:, :, 5]).addcmul_(a, y, value=-1)
 
 
+def twist_rows(gradients: Tensor) -> Tensor:
+    """What the exact Hessian adds to the rotations' rows, ``[g]x^T`` as (B, C', 3, 3, n), for gradients (B, C', 3, n).
+
+    A step of a camera turns the point it sees about the world's origin: ``g . (omega x X)`` has the mixed derivative ``[g]x``.
+    """
+    x, y, z = gradients.unbind(2)
+    zero = torch.zeros_like(x)
+    return torch.stack([zero, z, -y, -z, zero, x, y, -x, zero], dim=2).unflatten(2, (3, 3))
+
+
 def symmetric_times(blocks: Tensor, vectors: Tensor) -> Tensor:
     """``sum_c N_c v_c`` (B, 3, n) for blocks (B, C', 6, n) and vectors (B, C', 3, n)."""
     xx, xy, xz, yy, yz, zz = blocks.unbind(2)

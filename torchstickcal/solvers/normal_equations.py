@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import itertools
 import math
+from collections.abc import Iterator, Mapping
 from functools import lru_cache, reduce
 from typing import NamedTuple
 
@@ -20,6 +21,7 @@ import torch
 from torch import Tensor
 
 from torchstickcal import se3
+from torchstickcal.losses.base import CameraPointTerms
 from torchstickcal.objective import Objective
 from torchstickcal.problem import Columns, State
 from torchstickcal.solvers.base import IterationRecord
@@ -27,7 +29,7 @@ from torchstickcal.solvers.cross_blocks import cross_rows, symmetric_times
 from torchstickcal.solvers.parts import Couplings, Part, parts
 from torchstickcal.solvers.point_elimination import PointElimination
 from torchstickcal.solvers.track_elimination import TrackElimination
-from torchstickcal.symmetric import DIAGONAL, IDENTITY, inverse_diagonal, outer, raised
+from torchstickcal.symmetric import DIAGONAL, IDENTITY, inverse_diagonal, raised
 
 _KEPT_BYTES = 2**28
 """Size of the blocks N_c up to which they are kept for the back-substitution."""
@@ -51,10 +53,23 @@ class Step(NamedTuple):
 
 
 class _Eliminated(NamedTuple):
-    """A part with its coupling to the cameras, the blocks N_c (B, C', 6, n), and the factor of its own Hessian."""
+    """A part with its coupling to the cameras and the factor of its own Hessian."""
 
     cross: Tensor
+    """(B, C', 6, n), the blocks N_c"""
+    twist: Tensor | None
+    """(B, C', 3, n), the cameras' gradients, where the Hessian is exact"""
     elimination: PointElimination | TrackElimination
+
+    def reductions(self, points: Tensor, gradient: Tensor) -> tuple[Tensor, Tensor]:
+        """Those of the elimination, at points and for a gradient (B, 3, n)."""
+        return self.elimination.reductions(self.cross, points, gradient, self.twist)
+
+    def carried(self, points: Tensor, camera_step: Tensor) -> Tensor:
+        """``H_xc`` times a step (B, C', 6) of the cameras, (B, 3, n)."""
+        turns = se3.hat(camera_step[..., 3:])
+        moved = symmetric_times(self.cross, se3.moved(turns, camera_step[..., :3], points).to(self.cross.dtype))
+        return moved if self.twist is None else moved - (turns.to(moved.dtype) @ self.twist).sum(1)
 
 
 class NormalEquations:
@@ -65,6 +80,8 @@ class NormalEquations:
         state: where.
         cameras_free: whether the cameras are unknowns; the first one never is.
         damping: factor by which the diagonal of the Hessian is raised, one number or one per session (B,).
+        exact: whether the Hessian is the exact one, with the curvature of kernels, projections and lengths, instead of Gauss
+            and Newton's (track losses have to be quadratic). It need not be definite anywhere but at a minimum.
     """
 
     terms: dict[str, Tensor]
@@ -82,8 +99,16 @@ class NormalEquations:
     reduced_gradient: Tensor
     """(B, 6 C'), the gradient that is left for the cameras once the points follow them"""
 
-    def __init__(self, objective: Objective, state: State, cameras_free: bool, damping: float | Tensor = 0.0) -> None:
+    def __init__(
+        self,
+        objective: Objective,
+        state: State,
+        cameras_free: bool,
+        damping: float | Tensor = 0.0,
+        exact: bool = False,
+    ) -> None:
         m = objective.measurements
+        self._exact = exact
         self.objective, self.state = objective, state
         self._count = m.num_cameras - 1 if cameras_free else 0
         self._damping = torch.as_tensor(damping, dtype=torch.float64, device=state.points.device).expand(m.sessions)
@@ -106,10 +131,10 @@ class NormalEquations:
         point_step = torch.empty_like(gradient)
         descent = -(self.camera_gradient * camera_step).sum((1, 2))
         held = (self._camera_diagonal * camera_step.square()).sum((1, 2))
-        for index, part in enumerate(self._parts):
-            cross, elimination = self._kept[index] if self._kept else self._eliminated(part)
+        for part, eliminated in self._eliminations():
             rhs = gradient[..., part.columns]
-            solved = elimination.solve(rhs + self._carried(part, cross, camera_step)).neg_()
+            carried = eliminated.carried(self.state.points[..., part.columns], camera_step)
+            solved = eliminated.elimination.solve(rhs + carried).neg_()
             point_step[..., part.columns] = solved
             descent -= (rhs * solved).sum((1, 2), dtype=torch.float64)
             held += (hessian[..., part.columns][:, DIAGONAL] * solved.square()).sum((1, 2), dtype=torch.float64)
@@ -124,6 +149,25 @@ class NormalEquations:
             camera_sigmas=squared_sigmas.clamp_min(0.0).sqrt() if self._count else squared_sigmas.fill_(math.inf),
         )
 
+    def solve(self, camera_rhs: Tensor, point_rhs: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """The whole Hessian's inverse times a right-hand side of cameras (B, C', 6) and points (B, 3, N).
+
+        Returns:
+            Both parts of the solution, and (B,) whether the Hessian is positive definite.
+        """
+        reduced_rhs = camera_rhs.flatten(1)
+        for part, eliminated in self._eliminations():
+            if self._count:
+                rows, half = eliminated.reductions(self._points(part.columns), point_rhs[..., part.columns])
+                reduced_rhs = reduced_rhs - (rows @ half[..., None])[..., 0]
+        factor, failed = torch.linalg.cholesky_ex(self.reduced)
+        cameras = torch.cholesky_solve(reduced_rhs[..., None], factor)[..., 0].view_as(camera_rhs)
+        points = torch.empty_like(point_rhs)
+        for part, eliminated in self._eliminations():
+            carried = eliminated.carried(self.state.points[..., part.columns], cameras)
+            points[..., part.columns] = eliminated.elimination.solve(point_rhs[..., part.columns] - carried)
+        return cameras, points, (failed == 0) & cameras.flatten(1).isfinite().all(1) & points.flatten(1).isfinite().all(1)
+
     def point_variance(self) -> Tensor:
         """Mean variance along the axes of each point (B, N), cameras known, stick ends taken singly, square metres."""
         variance = torch.empty_like(self.point_hessian[:, 0])
@@ -136,10 +180,10 @@ class NormalEquations:
         points = self.state.points
         response = points.new_empty(len(points), 6 * self._count, *points.shape[1:])
         for part in self._parts:
-            cross, elimination = self._eliminated(part)
-            rows = cross_rows(cross, self._points(part.columns)).flatten(1, 2)
+            eliminated = self._eliminated(part)
+            rows = cross_rows(eliminated.cross, self._points(part.columns)).flatten(1, 2)
             for row in range(rows.shape[1]):
-                response[:, row][..., part.columns] = -elimination.solve(rows[:, row])
+                response[:, row][..., part.columns] = -eliminated.elimination.solve(rows[:, row])
         return response
 
     def records(self, stage: str, iterations: list[int], dampings: list[float], steps_m: list[float]) -> list[IterationRecord]:
@@ -177,10 +221,9 @@ class NormalEquations:
         m, coupling = self.objective.measurements, None
         starts, ends = m.pairs.unbind(1)
         hessian, gradient = m.by_frame(self.point_hessian), m.by_frame(self.point_gradient)
-        for name, pair in self.objective.linearise_pairs(self.state).items():
+        for name, pair in self.objective.linearise_pairs(self.state, self._exact).items():
             self.terms[name] = self.terms[name] + pair.cost
-            block = outer(pair.jacobian.flatten(2)).unflatten(-1, pair.residual.shape[1:]).to(hessian.dtype)
-            slope = (pair.jacobian * pair.residual[:, None]).to(hessian.dtype)
+            block, slope = pair.hessian.to(hessian.dtype), pair.gradient.to(hessian.dtype)
             hessian[..., starts] += block
             hessian[..., ends] += block
             gradient[..., starts] -= slope
@@ -217,15 +260,14 @@ class NormalEquations:
         if count * m.sessions * m.num_columns * 6 * m.pixels.element_size() <= _KEPT_BYTES:
             self._kept = []
         for part in self._parts:
-            crosses: list[Tensor] = []
+            crosses: list[tuple[Tensor, Tensor]] = []
             for columns in part.chunks:
-                blocks = self.objective.linearise_chunk(self.state, columns)
+                blocks = self.objective.linearise_chunk(self.state, columns, self._exact)
                 for name, block in blocks.items():
                     self.terms[name] = self.terms[name] + block.cost
                     squares += block.squares
                     weights += block.weights
-                gradient = reduce(torch.add, (block.gradient for block in blocks.values()))
-                hessian = reduce(torch.add, (block.hessian for block in blocks.values()))
+                gradient, hessian = _summed(blocks)
                 self.point_gradient[..., columns] += gradient.sum(1)
                 self.point_hessian[..., columns] += hessian.sum(1)
                 if count:
@@ -234,18 +276,18 @@ class NormalEquations:
                     products = homogeneous[:, _PRODUCTS[0]] * homogeneous[:, _PRODUCTS[1]]
                     gradient_moments += gradient[:, 1:].flatten(1, 2) @ homogeneous.mT
                     hessian_moments += hessian[:, 1:].flatten(1, 2) @ products.mT
-                    crosses.append(hessian[:, 1:])
+                    crosses.append((hessian[:, 1:], gradient[:, 1:]))
             if count:
                 eliminated = self._eliminated(part, crosses)
-                rows, half = eliminated.elimination.reductions(
-                    eliminated.cross, self._points(part.columns), self.point_gradient[..., part.columns]
-                )
+                rows, half = eliminated.reductions(self._points(part.columns), self.point_gradient[..., part.columns])
                 reduced -= rows @ rows.mT
                 reduced_gradient -= (rows @ half[..., None])[..., 0]
                 if self._kept is not None:
                     self._kept.append(eliminated)
         gradient_map, hessian_map = _moment_maps(self.state.points.device)
         blocks = (hessian_moments.view(m.sessions, count, 60) @ hessian_map).view(m.sessions, count, 6, 6)
+        if self._exact:
+            blocks += _turning(gradient_moments.view(m.sessions, count, 3, 4))
         self._camera_diagonal = blocks.diagonal(dim1=2, dim2=3).clone()
         blocks.diagonal(dim1=2, dim2=3).mul_(1 + self._damping[:, None, None])
         on_diagonal = reduced.view(m.sessions, count, 6, count, 6).diagonal(dim1=1, dim2=3)
@@ -254,28 +296,45 @@ class NormalEquations:
         self.reduced, self.reduced_gradient = reduced, reduced_gradient + self.camera_gradient.flatten(1)
         self.reprojection_px = (squares / weights.clamp_min(1e-300)).sqrt()
 
-    def _eliminated(self, part: Part, crosses: list[Tensor] | None = None) -> _Eliminated:
-        """A part's factor and coupling to the cameras, of its blocks N_c by chunk where they are at hand."""
-        if crosses is None:
-            crosses = [self._cross(columns) for columns in part.chunks]
-        cross = crosses[0] if len(crosses) == 1 else torch.cat(crosses, dim=-1)
-        return _Eliminated(cross, part.eliminate(raised(self.point_hessian[..., part.columns], self._damping)))
+    def _eliminations(self) -> Iterator[tuple[Part, _Eliminated]]:
+        """All parts, eliminated: kept ones, or done again."""
+        for index, part in enumerate(self._parts):
+            yield part, self._kept[index] if self._kept else self._eliminated(part)
 
-    def _cross(self, columns: Columns) -> Tensor:
-        """The blocks N_c of the cameras solved for, (B, C', 6, n)."""
+    def _eliminated(self, part: Part, blocks: list[tuple[Tensor, Tensor]] | None = None) -> _Eliminated:
+        """A part's factor and coupling to the cameras, of its blocks N_c and gradients by chunk where they are at hand."""
+        elimination = part.eliminate(raised(self.point_hessian[..., part.columns], self._damping))
         if not self._count:
-            return self.point_hessian[:, None, :, columns][:, :0]
-        blocks = self.objective.linearise_chunk(self.state, columns).values()
-        return reduce(torch.add, (block.hessian for block in blocks))[:, 1:]
-
-    def _carried(self, part: Part, cross: Tensor, camera_step: Tensor) -> Tensor:
-        """``H_xc`` times a step of the cameras, (B, 3, n)."""
-        points = self.state.points[..., part.columns]
-        moved = se3.moved(se3.hat(camera_step[..., 3:]), camera_step[..., :3], points)
-        return symmetric_times(cross, moved.to(cross.dtype))
+            nothing = self.point_hessian[:, None, :, part.columns][:, :0]
+            return _Eliminated(nothing, None, elimination)
+        if blocks is None:
+            chunks = (self.objective.linearise_chunk(self.state, columns, self._exact) for columns in part.chunks)
+            blocks = [(hessian[:, 1:], gradient[:, 1:]) for gradient, hessian in map(_summed, chunks)]
+        cross, twist = (pieces[0] if len(pieces) == 1 else torch.cat(pieces, dim=-1) for pieces in zip(*blocks, strict=True))
+        return _Eliminated(cross, twist if self._exact else None, elimination)
 
     def _points(self, columns: Columns) -> Tensor:
         return self.state.points[..., columns].to(self.point_hessian.dtype)
+
+
+def _summed(blocks: Mapping[str, CameraPointTerms]) -> tuple[Tensor, Tensor]:
+    """Gradients (B, C, 3, n) and Hessians (B, C, 6, n) of all camera-point losses."""
+    gradient = reduce(torch.add, (block.gradient for block in blocks.values()))
+    return gradient, reduce(torch.add, (block.hessian for block in blocks.values()))
+
+
+def _turning(moments: Tensor) -> Tensor:
+    """What the exact Hessian adds for turning a camera about the world's origin, (B, C', 6, 6), of moments of g (B, C', 3, 4).
+
+    To second order ``Exp(nu, omega) X = X + nu + omega x X + (omega x nu + omega x (omega x X)) / 2``.
+    """
+    gradient, by_point = moments[..., 0], moments[..., 1:]
+    added = moments.new_zeros(*moments.shape[:2], 6, 6)
+    added[..., :3, 3:] = se3.hat(gradient) / 2
+    added[..., 3:, :3] = added[..., :3, 3:].mT
+    trace = by_point.diagonal(dim1=-2, dim2=-1).sum(-1)
+    added[..., 3:, 3:] = (by_point + by_point.mT) / 2 - trace[..., None, None] * torch.eye(3).to(moments)
+    return added
 
 
 _PRODUCTS = ([0, 0, 0, 0, 1, 1, 1, 2, 2, 3], [0, 1, 2, 3, 1, 2, 3, 2, 3, 3])

@@ -8,7 +8,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from torchstickcal.solvers.cross_blocks import add_rotations
+from torchstickcal.solvers.cross_blocks import add_rotations, twist_rows
 from torchstickcal.symmetric import backward, cholesky, expand, forward, gram
 
 
@@ -52,15 +52,18 @@ class PointElimination:
         """``H^-1 b`` of a right-hand side (B, 3, n)."""
         return self.back_solve(self.half_solve(rhs))
 
-    def reductions(self, cross: Tensor, points: Tensor, gradient: Tensor) -> tuple[Tensor, Tensor]:
+    def reductions(self, cross: Tensor, points: Tensor, gradient: Tensor, twist: Tensor | None = None) -> tuple[Tensor, Tensor]:
         """``(L^-1 H_xc)^T`` (B, 6 C', 3 n) and ``L^-1 g`` (B, 3 n).
 
         Args:
             cross: the blocks N_c of C' cameras, (B, C', 6, n).
             points: X, (B, 3, n).
             gradient: g, (B, 3, n).
+            twist: the gradients of each camera's part of the cost, (B, C', 3, n), where H_xc is to be exact.
         """
         rows = _camera_rows(self._lower, cross, points)
+        if twist is not None:
+            rows[:, :, 3:] += forward(self._lower[:, None, None], twist_rows(twist))
         if self._coupled:
             rows[..., self._ends] += (self._carry[:, None, None] * rows[..., self._starts].unsqueeze(-2)).sum(-3)
         return rows.flatten(3).flatten(1, 2), self.half_solve(gradient).flatten(1)

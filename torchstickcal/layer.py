@@ -1,0 +1,344 @@
+"""The calibration as a differentiable layer of a network."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, fields, replace
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor, nn
+
+from torchstickcal.cameras import Intrinsics
+from torchstickcal.config import Config, Stage, load_config
+from torchstickcal.errors import CalibrationError, ObservationError
+from torchstickcal.gradients import GradientMode, attach, gradient_mode
+from torchstickcal.initialise import initialise, triangulated
+from torchstickcal.objective import Objective
+from torchstickcal.observations import Observations, Stick
+from torchstickcal.pipeline import points_used
+from torchstickcal.problem import Measurements, State
+from torchstickcal.solvers import IterationRecord
+from torchstickcal.solvers.newton import polish
+from torchstickcal.stages import Ruler, StageResult, rulers, run_stage, scale_factors
+
+_KEYPOINTS_AT_ONCE = 32_000
+"""Keypoints of the sessions that a CPU solves side by side: more would leave its cache."""
+
+
+@dataclass(frozen=True)
+class LayerResult:
+    """Calibrated rigs, in the frame of each session's first camera; leading B only where the keypoints had it.
+
+    ``rotations``, ``translations`` and ``points`` carry gradients, and have the dtype and device of the keypoints.
+    """
+
+    rotations: Tensor
+    """(B, C, 3, 3), world to camera; the identity where a session could not be calibrated"""
+    translations: Tensor
+    """(B, C, 3), metres; zero where a session could not be calibrated"""
+    points: Tensor
+    """(B, F, P, 3), metres; zero where ``known`` is False"""
+    known: Tensor
+    """(B, F, P), whether two cameras or more see a point"""
+    inliers: Tensor
+    """(B, C, F, P), which keypoints took part"""
+    sigma_px: Tensor
+    """(B, P), noise of each point's keypoints"""
+    converged: Tensor
+    """(B,); the gradients of a session that could not be calibrated are zero"""
+    status: tuple[str, ...]
+    """``converged``, or why not, for each session"""
+
+
+class CalibrationLayer(nn.Module):
+    """From keypoints to cameras and points in metres, with gradients back to keypoints, confidence, intrinsics and lengths.
+
+    The noise of the keypoints and the choice of outliers, where the configuration estimates them, count as constants.
+
+    Args:
+        sticks: the stick or sticks, as of :class:`Observations`.
+        config: as of :func:`torchstickcal.calibrate`; its solver does not matter to the gradients.
+        gradient: ``implicit`` (exact), ``gauss_newton`` (approximate), ``unrolled``, or a :class:`GradientMode`.
+    """
+
+    def __init__(
+        self,
+        sticks: Stick | Sequence[Stick],
+        config: str | Path | Mapping[str, Any] | Config = "default",
+        gradient: str | GradientMode = "implicit",
+    ) -> None:
+        super().__init__()
+        self.sticks = (sticks,) if isinstance(sticks, Stick) else tuple(sticks)
+        self.config = load_config(config)
+        self.gradient = gradient_mode(gradient)
+
+    def forward(
+        self,
+        keypoints: Tensor,
+        intrinsics: Tensor | Intrinsics,
+        stick_lengths: Tensor | None = None,
+        confidence: Tensor | None = None,
+        initial: LayerResult | None = None,
+    ) -> LayerResult:
+        """Calibrate B sessions of equal shape, or one.
+
+        Args:
+            keypoints: (B, C, F, P, 2) or (C, F, P, 2), pixels, NaN where not seen.
+            intrinsics: camera matrices (3, 3), (C, 3, 3) or (B, C, 3, 3), or :class:`Intrinsics` with their lenses.
+            stick_lengths: (S,) or (B, S), metres, instead of the lengths of ``sticks``.
+            confidence: (B, C, F, P) or (C, F, P), in [0, 1].
+            initial: an earlier result to start from, if the keypoints have moved but little since. It saves the
+                initialisation and all stages before the last one that adjusts the cameras.
+
+        Raises:
+            ObservationError: for arguments whose shapes do not fit. A session that cannot be calibrated from is not an error
+                but a status.
+        """
+        batched = keypoints.ndim == 5
+        given = _Given.of(keypoints if batched else keypoints[None], intrinsics, stick_lengths, confidence, self.sticks)
+        with torch.autocast(keypoints.device.type, enabled=False):
+            result = self._calibrated(given, initial if batched or initial is None else _with_batch(initial))
+        return result if batched else _without_batch(result)
+
+    def _calibrated(self, given: _Given, initial: LayerResult | None) -> LayerResult:
+        """All sessions; those that can be begun are solved side by side."""
+        shape = given.keypoints.shape[:-1]
+        found = [_failed(shape[1:], given.keypoints) for _ in range(shape[0])]
+        begun: dict[int, _Begun] = {}
+        with torch.no_grad():
+            for index in range(shape[0]):
+                try:
+                    begun[index] = self._begin(given.observations(index, self.sticks), initial, index)
+                except CalibrationError as error:
+                    found[index] = found[index]._replace(status=f"{type(error).__name__}: {error}")
+        together = len(begun) if given.keypoints.is_cuda else max(1, _KEYPOINTS_AT_ONCE // shape[1:].numel())
+        for first in range(0, len(begun), together):
+            group = list(begun)[first : first + together]
+            solved = self._solve(given.of_sessions(group), [begun[index] for index in group], warm=initial is not None)
+            for index, session in zip(group, solved, strict=True):
+                found[index] = session
+        tensors = (torch.stack(values) for values in list(zip(*found, strict=True))[:-1])
+        return LayerResult(*tensors, status=tuple(session.status for session in found))
+
+    def _begin(self, observations: Observations, initial: LayerResult | None, index: int) -> _Begun:
+        """A session's measurements and where to start."""
+        measurements = Measurements.of(observations, points_used(observations, self.config))
+        settings = self.config.initialise
+        if initial is None or not bool(initial.converged[index]):
+            labels = [observations.camera_label(camera) for camera in range(observations.num_cameras)]
+            return _Begun(observations, measurements, initialise(measurements, settings, labels))
+        rotations, translations = (v[index][None].detach().double() for v in (initial.rotations, initial.translations))
+        points = initial.points[index].detach().double().flatten(0, 1).mT[None]
+        known = initial.known[index].flatten()
+        if bool((measurements.active[0] & ~known).any()):
+            points = points.where(known, triangulated(measurements, rotations, translations, settings))
+        return _Begun(observations, measurements, State(rotations, translations, points.contiguous()))
+
+    def _solve(self, given: _Given, begun: list[_Begun], warm: bool) -> list[_Solved]:
+        """Run the stages on sessions side by side, then tie the last ones to what was given."""
+        stages = list(self.config.stages.items())
+        last_free = max((number for number, (_, stage) in enumerate(stages) if stage.cameras == "free"), default=0)
+        measurements = Measurements.stack([session.measurements for session in begun])
+        state = State.stack([session.state for session in begun])
+        known = rulers([session.observations for session in begun], self.config)
+        reached: list[tuple[Stage, StageResult]] = []
+        with torch.no_grad():
+            for name, stage in stages[last_free if warm else 0 :]:
+                reached.append((stage, run_stage(name, stage, measurements, state, known, self.config.solver, _ignore)))
+                state = reached[-1][1].state
+        decisive = reached[last_free - len(stages) :]
+        tied = self._tied(given, measurements, decisive, known)
+        last = decisive[-1][1]
+        status = [
+            "; ".join(f"{record.name}: {record.stop}" for record in records if not record.stop.converged) or "converged"
+            for records in zip(*(result.records for _, result in decisive), strict=True)
+        ]
+        seen = measurements.by_frame(last.inliers.any(1))
+        points = measurements.by_frame(tied.points).movedim(1, -1).where(seen[..., None], 0.0)
+        dtype = given.keypoints.dtype
+        return [
+            _Solved(
+                tied.rotations[k].to(dtype),
+                tied.translations[k].to(dtype),
+                points[k].to(dtype),
+                seen[k],
+                measurements.by_frame(last.inliers[k]),
+                last.sigma_px[k].to(dtype),
+                torch.tensor(status[k] == "converged", device=points.device),
+                status[k],
+            )
+            for k in range(len(begun))
+        ]
+
+    def _tied(
+        self,
+        given: _Given,
+        measurements: Measurements,
+        decisive: Sequence[tuple[Stage, StageResult]],
+        known: Sequence[Ruler],
+    ) -> State:
+        """The result of the last stage that adjusts the cameras and of those after it, with gradients."""
+        data = given.measurements(measurements)
+        rulers_given = [
+            replace(ruler, lengths_m=data.lengths_m[:, number]) if ruler.rigid else ruler for number, ruler in enumerate(known)
+        ]
+        state: State | None = None
+        for stage, result in decisive:
+            kept = replace(data, confidence=data.confidence.where(result.inliers, 0.0))
+            held = (state.rotations, state.translations) if state is not None and stage.cameras == "held" else None
+            minimum = _polished(kept, result, held)
+            state = attach(Objective(kept, result.losses), minimum, self.gradient, held)
+            if stage.rescale:
+                state = state.scaled(scale_factors(kept, state.points, rulers_given))
+        assert state is not None
+        return state
+
+
+class _Begun(NamedTuple):
+    """A session on its way into the solver."""
+
+    observations: Observations
+    measurements: Measurements
+    state: State
+
+
+class _Solved(NamedTuple):
+    """One session of :class:`LayerResult`."""
+
+    rotations: Tensor
+    translations: Tensor
+    points: Tensor
+    known: Tensor
+    inliers: Tensor
+    sigma_px: Tensor
+    converged: Tensor
+    status: str
+
+
+@torch.no_grad()
+def _polished(measurements: Measurements, result: StageResult, held: tuple[Tensor, Tensor] | None) -> State:
+    """A stage's minimum, to rounding: a gradient is worth as much as the minimum that it is taken at."""
+    start = result.minimum
+    if held is not None:
+        start = replace(start, rotations=held[0].detach(), translations=held[1].detach())
+    return polish(Objective(measurements, result.losses), start, cameras_free=held is None)
+
+
+def _failed(shape: torch.Size, like: Tensor) -> _Solved:
+    """A session of C cameras, F frames and P points that could not be calibrated."""
+    cameras, frames, points = shape
+    nothing = torch.zeros(cameras, frames, points, dtype=torch.bool, device=like.device)
+    return _Solved(
+        torch.eye(3).to(like).expand(cameras, 3, 3),
+        like.new_zeros(cameras, 3),
+        like.new_zeros(frames, points, 3),
+        nothing[0],
+        nothing,
+        like.new_zeros(points),
+        nothing[0, 0, 0],
+        "",
+    )
+
+
+@dataclass(frozen=True)
+class _Given:
+    """What a layer was given, with a batch dimension throughout."""
+
+    keypoints: Tensor
+    """(B, C, F, P, 2)"""
+    confidence: Tensor | None
+    """(B, C, F, P)"""
+    cameras: Intrinsics
+    """(B, C, ...), float64"""
+    lengths_m: Tensor
+    """(B, S), float64"""
+
+    @staticmethod
+    def of(
+        keypoints: Tensor,
+        intrinsics: Tensor | Intrinsics,
+        stick_lengths: Tensor | None,
+        confidence: Tensor | None,
+        sticks: Sequence[Stick],
+    ) -> _Given:
+        """Arguments of a forward pass, ``keypoints`` (B, C, F, P, 2), checked for their shapes."""
+        if keypoints.ndim != 5 or keypoints.shape[-1] != 2:
+            raise ObservationError(
+                "keypoints have the wrong shape",
+                where="keypoints",
+                got=tuple(keypoints.shape),
+                expected="(B, cameras, frames, points, 2) or (cameras, frames, points, 2)",
+            )
+        sessions, cameras = keypoints.shape[:2]
+        if stick_lengths is None:
+            stick_lengths = torch.tensor([stick.length_m for stick in sticks], dtype=torch.float64)
+        lens = intrinsics if isinstance(intrinsics, Intrinsics) else Intrinsics(intrinsics)
+        distortion = lens.distortion
+        if distortion is not None:
+            distortion = _expanded("distortion", distortion, (sessions, cameras, distortion.shape[-1]), keypoints)
+        return _Given(
+            keypoints,
+            None if confidence is None else confidence.reshape(keypoints.shape[:-1]),
+            Intrinsics(_expanded("intrinsics", lens.matrix, (sessions, cameras, 3, 3), keypoints), distortion, lens.fisheye),
+            _expanded("stick_lengths", stick_lengths, (sessions, len(sticks)), keypoints),
+        )
+
+    def of_sessions(self, chosen: list[int]) -> _Given:
+        """Some of the sessions."""
+        confidence = None if self.confidence is None else self.confidence[chosen]
+        return _Given(self.keypoints[chosen], confidence, self.cameras[chosen], self.lengths_m[chosen])
+
+    def observations(self, index: int, sticks: Sequence[Stick]) -> Observations:
+        """One session, without gradients."""
+        distortion = self.cameras.distortion
+        lengths = self.lengths_m[index].tolist()
+        return Observations(
+            self.keypoints[index].detach(),
+            self.cameras.matrix[index].detach(),
+            [replace(stick, length_m=length) for stick, length in zip(sticks, lengths, strict=True)],
+            distortion=None if distortion is None else distortion[index].detach(),
+            confidence=None if self.confidence is None else self.confidence[index].detach(),
+            fisheye=self.cameras.fisheye,
+        )
+
+    def measurements(self, solved: Measurements) -> Measurements:
+        """Measurements as those that were solved, with gradients."""
+        visible = solved.by_frame(solved.visible)
+        keypoints = torch.where(visible[..., None], self.keypoints.double(), 0.0)
+        confidence = visible.double() if self.confidence is None else self.confidence.double().where(visible, 0.0)
+        return replace(
+            solved,
+            pixels=keypoints.movedim(-1, 2).flatten(3),
+            confidence=confidence.flatten(2),
+            cameras=self.cameras,
+            lengths_m=self.lengths_m,
+        )
+
+
+def _expanded(name: str, tensor: Tensor, shape: tuple[int, ...], like: Tensor) -> Tensor:
+    """A tensor in float64, expanded to a shape.
+
+    Raises:
+        ObservationError: if it does not fit.
+    """
+    try:
+        return tensor.to(like.device, torch.float64).expand(shape)
+    except RuntimeError as error:
+        expected = f"{shape}, or fewer dimensions where all are alike"
+        raise ObservationError("the wrong shape", where=name, got=tuple(tensor.shape), expected=expected) from error
+
+
+def _with_batch(result: LayerResult) -> LayerResult:
+    tensors = {field.name: getattr(result, field.name) for field in fields(result) if field.name != "status"}
+    return replace(result, **{name: tensor[None] for name, tensor in tensors.items()})
+
+
+def _without_batch(result: LayerResult) -> LayerResult:
+    tensors = {field.name: getattr(result, field.name) for field in fields(result) if field.name != "status"}
+    return replace(result, **{name: tensor[0] for name, tensor in tensors.items()})
+
+
+def _ignore(record: IterationRecord) -> None:
+    return

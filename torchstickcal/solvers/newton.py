@@ -1,0 +1,37 @@
+"""The last steps to a minimum, with the exact Hessian: quadratic where Gauss-Newton is linear."""
+
+from __future__ import annotations
+
+import torch
+
+from torchstickcal.objective import Objective
+from torchstickcal.problem import State
+from torchstickcal.solvers.normal_equations import NormalEquations
+
+_MAX_STEPS = 8
+_STEP_SIGMAS = 1e-9
+_ROUNDING = 1e-12
+
+
+def polish(objective: Objective, state: State, cameras_free: bool) -> State:
+    """Where Newton's method leads from a state near a minimum; a session in which it leads nowhere stays as it is.
+
+    Args:
+        objective: what is least at the minimum; its track losses have to be quadratic.
+        state: where a solver has ended.
+        cameras_free: whether all cameras but the first are unknowns too.
+    """
+    best, cost = state, torch.full((objective.measurements.sessions,), torch.inf, dtype=torch.float64)
+    cost = cost.to(state.points.device)
+    trial = state
+    for _ in range(_MAX_STEPS):
+        system = NormalEquations(objective, trial, cameras_free, exact=True)
+        lower = system.cost <= cost * (1 + _ROUNDING)
+        best, cost = best.replaced(lower, trial), torch.minimum(system.cost, cost)
+        cameras, points, solved = system.solve(system.camera_gradient, system.point_gradient)
+        squared_sigmas = (system.camera_gradient * cameras).sum((1, 2)) + (system.point_gradient * points).sum((1, 2))
+        moving = lower & solved & (squared_sigmas > _STEP_SIGMAS**2)
+        if not bool(moving.any()):
+            break
+        trial = best.replaced(moving, best.retracted(-cameras, -points))
+    return best
