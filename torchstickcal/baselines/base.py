@@ -106,7 +106,8 @@ def scaled_by_height(inputs: Inputs, measurements: Measurements, state: State) -
         MissingInputError: if the height is not given.
     """
     top, *ankles = (inputs.observations.point_index(name) for name in ("head_top", "left_ankle", "right_ankle"))
-    ruler = Ruler((top,), tuple(ankles), (required(inputs, "height_m"),), rigid=False)
+    height_m = measurements.lengths_m.new_full((1,), required(inputs, "height_m"))
+    ruler = Ruler((top,), tuple(ankles), height_m, rigid=False)
     return state.scaled(scale_factors(measurements, state.points, [ruler]))
 
 

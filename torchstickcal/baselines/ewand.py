@@ -44,7 +44,8 @@ def ewand(inputs: Inputs) -> Estimate:
     measurements = Measurements.of(observations, ends | set(middle))
     labels = [observations.camera_label(camera) for camera in range(observations.num_cameras)]
     state = initialise(measurements, InitialiseSettings(), labels)
-    known = [Ruler((stick.start,), (stick.end,), (stick.length_m,), rigid=True) for stick in observations.sticks]
+    lengths_m = measurements.lengths_m.unbind(1)
+    known = [Ruler((s.start,), (s.end,), length_m, True) for s, length_m in zip(observations.sticks, lengths_m, strict=True)]
     state = state.scaled(scale_factors(measurements, state.points, known))
     adjusted = adjust(measurements, state, ReprojectionLoss(kernel=Huber()), _wand(measurements, middle))
     status = "converged" if adjusted.converged else "the bundle adjustment stopped before it had converged"
