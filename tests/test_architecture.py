@@ -23,7 +23,9 @@ LAYERS = [
     ["pipeline", "metrics", "report", "figures"],
     ["layer"],
     ["io"],
-    ["simulate", "benchmark", "monitor"],
+    ["simulate", "monitor"],
+    ["baselines"],
+    ["benchmark"],
     ["cli"],
 ]
 RANK = {name: rank for rank, names in enumerate(LAYERS) for name in names}

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from torchstickcal import calibrate, load_config
-from torchstickcal.benchmark import score_sequence, session_files, summarise
+from torchstickcal.benchmark import Source, score_sequence, sources, summarise
 from torchstickcal.io import read_session
 from torchstickcal.metrics import pose_errors
 
@@ -17,8 +17,8 @@ LIMIT_DEG, LIMIT_M = 0.00488, 0.000370
 
 
 @pytest.fixture(scope="module")
-def sequences(data: Path) -> list[Path]:
-    return session_files(data / "sports_stick_syn")
+def sequences(data: Path) -> tuple[Source, ...]:
+    return sources(str(data / "sports_stick_syn"))
 
 
 @pytest.mark.parametrize(
@@ -31,18 +31,20 @@ def sequences(data: Path) -> list[Path]:
         ("human_only", 0.0062, 0.015),
     ],
 )
-def test_sports_stick_syn(sequences: list[Path], config: str, rotation_deg: float, translation_m: float):
+def test_sports_stick_syn(sequences: tuple[Source, ...], config: str, rotation_deg: float, translation_m: float):
     settings = load_config(config)
-    summary = summarise([score for path in sequences if (score := score_sequence(path, settings))])
+    summary = summarise([score for source in sequences if (score := score_sequence(source, settings))])
     assert summary["converged"] == len(sequences)
     assert summary["mean_rotation_deg"] <= rotation_deg
     assert summary["mean_translation_m"] <= translation_m
 
 
 @pytest.mark.parametrize("config", ["default", "paper"])
-def test_both_solvers_agree(sequences: list[Path], config: str):
-    for path in sequences[::4]:
-        observations, _ = read_session(path)
+def test_both_solvers_agree(sequences: tuple[Source, ...], config: str):
+    for source in sequences[::4]:
+        case = source.load()
+        assert case is not None
+        observations = case.observations
         ours, theirs = calibrate(observations, config), calibrate(observations, {"extends": config, "solver": "lbfgs"})
         cost, other = (calibration.stages[-1].iterations[-1].cost for calibration in (ours, theirs))
         assert cost == pytest.approx(other, rel=1e-6)

@@ -56,11 +56,17 @@ def _parser() -> argparse.ArgumentParser:
     command.set_defaults(run=_evaluate)
 
     command = commands.add_parser(
-        "benchmark", help="calibrate a folder of sessions with truth", description="Calibrate a folder of sessions with truth."
+        "benchmark",
+        help="measure on sessions with truth",
+        description="Score a configuration on sessions with truth, or with --out all methods, with tables and figures.",
     )
-    command.add_argument("folder", metavar="FOLDER", type=Path, help="a folder of sessions")
-    command.add_argument("--json", metavar="FILE", type=Path, help="write the scores as JSON")
+    command.add_argument("place", metavar="DIR|PRESET", help="a folder of sessions, or a preset of the simulator")
+    command.add_argument("--count", metavar="N", type=int, help="only the first N sessions")
+    command.add_argument("--json", metavar="FILE", type=Path, help="write the scores as JSON (without --out)")
     _add_config(command)
+    command.add_argument("--out", metavar="DIR", type=Path, help="folder for the results; what it holds is not measured again")
+    command.add_argument("--methods", metavar="A,B", help="with --out: which methods (default: all; a wrong name lists them)")
+    command.add_argument("--jobs", metavar="N", type=int, default=1, help="with --out: processes (default: 1)")
     command.set_defaults(run=_benchmark)
 
     command = commands.add_parser(
@@ -137,19 +143,21 @@ def _evaluate(options: argparse.Namespace) -> int:
 
 
 def _benchmark(options: argparse.Namespace) -> int:
-    from torchstickcal.benchmark import score_sequence, session_files, summarise
+    from torchstickcal.benchmark import score_sequence, sources, summarise
     from torchstickcal.config import load_config
 
+    if options.out is not None:
+        return _measure(options)
     _use_threads(options.threads)
     config = load_config(options.config)
-    files = session_files(options.folder)
-    width = max(len(file.stem) for file in files)
+    cases = sources(options.place, options.count)
+    width = max(len(case.name) for case in cases)
     scores = []
     print(f"{'session':{width}}  rotation (deg)  translation (mm)  time (ms)  status")
-    for file in files:
-        score = score_sequence(file, config)
+    for case in cases:
+        score = score_sequence(case, config)
         if score is None:
-            print(f"{file.stem} passed over: it carries no truth", file=sys.stderr)
+            print(f"{case.name} passed over: it carries no truth", file=sys.stderr)
             continue
         scores.append(score)
         rotation = "-" if score.rotation_deg is None else f"{score.rotation_deg:.5f}"
@@ -163,6 +171,31 @@ def _benchmark(options: argparse.Namespace) -> int:
         print(f"{'mean':{width}}  {mean}  {'':9}  {summary['converged']} of {len(scores)} converged")
     _write_json(options.json, summary)
     return EXIT_DONE if scores and summary["converged"] == len(scores) else EXIT_NOT_CONVERGED
+
+
+def _measure(options: argparse.Namespace) -> int:
+    """All methods: rows, tables, figures and pages in a folder."""
+    from torchstickcal.benchmark import METHODS, method, run_benchmark, sources, write_results
+
+    names = options.methods.split(",") if options.methods else list(METHODS)
+    for name in names:
+        method(name)
+    cases = sources(options.place, options.count)
+    rows = run_benchmark(Path(options.place).name, cases, names, options.out, options.jobs, _progress_bar)
+    if not rows:
+        raise CalibrationError("no session with truth", where="benchmark", got=options.place, expected="sessions with truth")
+    write_results(rows, options.out)
+    print(f"{len(rows)} measurements, tables and figures in {options.out}")
+    return EXIT_DONE
+
+
+def _progress_bar(done: int, total: int, what: str) -> None:
+    """On a terminal a bar in place, else a line for each tenth."""
+    if sys.stderr.isatty():
+        bar = "#" * (30 * done // total)
+        print(f"\r[{bar:<30}] {done}/{total} {what:<60.60}", end="\n" if done == total else "", file=sys.stderr, flush=True)
+    elif 10 * done // total > 10 * (done - 1) // total:
+        print(f"{done}/{total} measured", file=sys.stderr, flush=True)
 
 
 def _simulate(options: argparse.Namespace) -> int:

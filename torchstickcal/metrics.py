@@ -17,9 +17,9 @@ class PoseErrors:
     """Errors of each camera."""
 
     rotation_deg: Tensor
-    """(C,)"""
+    """(..., C)"""
     translation_m: Tensor
-    """(C,), distance of the camera centres"""
+    """(..., C), distance of the camera centres"""
 
     @property
     def mean_rotation_deg(self) -> float:
@@ -33,7 +33,7 @@ class PoseErrors:
 
 
 def pose_errors(rotations: Tensor, translations: Tensor, true_rotations: Tensor, true_translations: Tensor) -> PoseErrors:
-    """Errors of estimated poses (C, 3, 3), (C, 3), world to camera, against the true ones.
+    """Errors of estimated poses (..., C, 3, 3), (..., C, 3), world to camera, against the true ones (C, 3, 3), (C, 3).
 
     The estimated camera centres are laid onto the true ones by the rotation and translation of least squares (Kabsch and
     Umeyama, no scale). Where the true centres lie on one line, as two cameras always do, they leave a rotation open, and
@@ -43,35 +43,27 @@ def pose_errors(rotations: Tensor, translations: Tensor, true_rotations: Tensor,
     centres, true_centres = se3.camera_centres(r, t), se3.camera_centres(r_true, t_true)
     spread = torch.linalg.svdvals(true_centres - true_centres.mean(0))
     if spread[1] <= _COLLINEAR * spread[0]:
-        rotation = r_true[0].mT @ r[0]
-        offset = true_centres[0] - rotation @ centres[0]
+        rotation = r_true[0].mT @ r[..., 0, :, :]
+        offset = true_centres[0] - (rotation @ centres[..., 0, :, None])[..., 0]
     else:
         rotation, offset = align(centres, true_centres)
     return PoseErrors(
-        rotation_deg=rotation_angle(r_true @ rotation @ r.mT).rad2deg(),
-        translation_m=(centres @ rotation.mT + offset - true_centres).norm(dim=1),
+        rotation_deg=rotation_angle(r_true @ rotation[..., None, :, :] @ r.mT).rad2deg(),
+        translation_m=(centres @ rotation.mT + offset[..., None, :] - true_centres).norm(dim=-1),
     )
 
 
 def align(source: Tensor, target: Tensor) -> tuple[Tensor, Tensor]:
-    """The rotation (3, 3) and translation (3,) that lay points (N, 3) onto others with least squared distances."""
-    centre, target_centre = source.mean(0), target.mean(0)
-    u, _, vh = torch.linalg.svd((target - target_centre).mT @ (source - centre))
+    """The rotations (..., 3, 3) and translations (..., 3) that lay points (..., N, 3) onto others by least squares."""
+    centre, target_centre = source.mean(-2), target.mean(-2)
+    u, _, vh = torch.linalg.svd((target - target_centre[..., None, :]).mT @ (source - centre[..., None, :]))
     sign = torch.ones_like(centre)
-    sign[2] = torch.det(u @ vh).sign()
-    rotation = u @ torch.diag(sign) @ vh
-    return rotation, target_centre - rotation @ centre
+    sign[..., 2] = torch.det(u @ vh).sign()
+    rotation = u @ (sign[..., None] * vh)
+    return rotation, target_centre - (rotation @ centre[..., None])[..., 0]
 
 
 def rotation_angle(rotations: Tensor) -> Tensor:
     """Angles (...) of rotations (..., 3, 3), radians; exact near zero, where an arc cosine loses half the digits."""
-    skew = torch.stack(
-        [
-            rotations[..., 2, 1] - rotations[..., 1, 2],
-            rotations[..., 0, 2] - rotations[..., 2, 0],
-            rotations[..., 1, 0] - rotations[..., 0, 1],
-        ],
-        dim=-1,
-    )
     trace = rotations.diagonal(dim1=-2, dim2=-1).sum(-1)
-    return torch.atan2(skew.norm(dim=-1), trace - 1)
+    return torch.atan2(2 * se3.vee(rotations).norm(dim=-1), trace - 1)

@@ -17,6 +17,12 @@ def hat(vectors: Tensor) -> Tensor:
     return torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], dim=-1).unflatten(-1, (3, 3))
 
 
+def vee(matrices: Tensor) -> Tensor:
+    """Vectors (..., 3) of cross-product matrices (..., 3, 3), of a general matrix those of its skew part."""
+    skew = (matrices - matrices.mT) / 2
+    return torch.stack([skew[..., 2, 1], skew[..., 0, 2], skew[..., 1, 0]], dim=-1)
+
+
 def exp(tangents: Tensor) -> tuple[Tensor, Tensor]:
     """Exponential map of SE(3): tangents (..., 6) to rotations (..., 3, 3) and translations (..., 3)."""
     translation, rotation = tangents[..., :3], tangents[..., 3:]

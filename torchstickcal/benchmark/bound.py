@@ -1,0 +1,63 @@
+"""The Cramer-Rao bound of the camera errors, in the paper's measure."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import torch
+
+from torchstickcal import se3
+from torchstickcal.benchmark.cases import Case
+from torchstickcal.losses import ReprojectionLoss, StickLengthLoss
+from torchstickcal.metrics import pose_errors
+from torchstickcal.objective import Objective
+from torchstickcal.problem import Measurements, State
+from torchstickcal.solvers.normal_equations import NormalEquations
+
+_SIGMA_LENGTH_M = 1e-5
+"""As good as exact: what the keypoints of a frame tell about the length is coarser by far."""
+
+
+@dataclass(frozen=True)
+class Bound:
+    """The least mean camera error that an unbiased estimate can be expected to have."""
+
+    rotation_deg: float
+    translation_m: float
+
+
+def camera_bound(case: Case, draws: int = 2000, seed: int = 0) -> Bound | None:
+    """The bound of a case for those who know its inliers, their noise and its lenses, and the stick's length exactly.
+
+    The inverse of the reduced camera system at the truth is the least covariance of the cameras. Errors drawn from it go
+    through the same alignment and the same mean as those of an estimate.
+
+    Args:
+        case: a session with true points.
+        draws: errors drawn; their mean scatters by some 50 % / sqrt(draws).
+        seed: of the draws.
+
+    Returns:
+        The bound; None where truth, noise or inliers are not known, or the inliers do not determine the cameras.
+    """
+    truth = case.truth
+    if truth.points is None or case.sigma_px is None or case.inliers is None:
+        return None
+    observations = case.observations
+    if truth.intrinsics is not None:
+        observations = replace(observations, intrinsics=truth.intrinsics, distortion=truth.distortion)
+    measurements = Measurements.of(observations).keeping(torch.from_numpy(case.inliers).flatten(1)[None])
+    sigma_px = torch.from_numpy(case.sigma_px).flatten(1).clamp_min(1e-6)
+    measurements = replace(measurements, confidence=measurements.visible / sigma_px.square())
+    objective = Objective(measurements, {"reprojection": ReprojectionLoss(), "stick_length": StickLengthLoss(_SIGMA_LENGTH_M)})
+    points = truth.points.flatten(0, 1).mT.contiguous()
+    state = State(truth.rotations[None], truth.translations[None], points[None])
+    factor, failed = torch.linalg.cholesky_ex(NormalEquations(objective, state, cameras_free=True).reduced[0])
+    if int(failed):
+        return None
+    normal = torch.randn(len(factor), draws, generator=torch.Generator().manual_seed(seed), dtype=factor.dtype)
+    tangents = torch.linalg.solve_triangular(factor.mT, normal, upper=True).mT.unflatten(1, (-1, 6))
+    tangents = torch.nn.functional.pad(tangents, (0, 0, 1, 0))
+    drawn = se3.retract(truth.rotations.expand(draws, -1, 3, 3), truth.translations.expand(draws, -1, 3), tangents)
+    errors = pose_errors(*drawn, truth.rotations, truth.translations)
+    return Bound(errors.mean_rotation_deg, errors.mean_translation_m)

@@ -1,0 +1,54 @@
+"""One configuration in the paper's measure over sessions with known truth."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from statistics import fmean, median
+from typing import Any
+
+from torchstickcal.benchmark.cases import Source
+from torchstickcal.config import Config
+from torchstickcal.errors import CalibrationError
+from torchstickcal.metrics import pose_errors
+from torchstickcal.pipeline import calibrate
+
+
+@dataclass(frozen=True)
+class SequenceScore:
+    """One session's errors; None where it could not be calibrated."""
+
+    name: str
+    rotation_deg: float | None
+    translation_m: float | None
+    seconds: float
+    status: str
+
+
+def score_sequence(source: Source, config: Config) -> SequenceScore | None:
+    """Calibrate a session and compare with its truth; None if it carries none.
+
+    A session that cannot be read or calibrated is scored without errors, its status saying why.
+    """
+    try:
+        case = source.load()
+        if case is None:
+            return None
+        calibration = calibrate(case.observations, config)
+    except CalibrationError as error:
+        return SequenceScore(source.name, None, None, 0.0, f"{type(error).__name__}: {error}")
+    errors = pose_errors(calibration.rotations, calibration.translations, case.truth.rotations, case.truth.translations)
+    seconds = calibration.seconds["total"]
+    return SequenceScore(source.name, errors.mean_rotation_deg, errors.mean_translation_m, seconds, calibration.status)
+
+
+def summarise(scores: list[SequenceScore]) -> dict[str, Any]:
+    """All scores and their means over the sessions that could be calibrated, as JSON can hold them."""
+    rotations = [score.rotation_deg for score in scores if score.rotation_deg is not None]
+    translations = [score.translation_m for score in scores if score.translation_m is not None]
+    return {
+        "sequences": [vars(score) for score in scores],
+        "mean_rotation_deg": fmean(rotations) if rotations else None,
+        "mean_translation_m": fmean(translations) if translations else None,
+        "median_seconds": median(score.seconds for score in scores) if scores else None,
+        "converged": sum(score.status == "converged" for score in scores),
+    }
