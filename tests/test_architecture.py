@@ -16,7 +16,7 @@ LAYERS = [
     ["config", "problem", "extrinsics"],
     ["objective"],
     ["solvers", "noise"],
-    ["gradients"],
+    ["gradients", "uncertainty"],
     ["initialise", "stages"],
     ["result"],
     ["assemble"],

@@ -20,6 +20,7 @@ def assemble(
     observations: Observations,
     measurements: Measurements,
     reached: StageResult,
+    covariance: Tensor | None,
     stages: Sequence[StageRecord],
     seconds: Mapping[str, float],
     session: int = 0,
@@ -30,6 +31,7 @@ def assemble(
         observations: the session as the user gave it.
         measurements: all that could take part, of all sessions solved together.
         reached: what the last stage ended with.
+        covariance: of the tangents of all sessions' cameras; None where no stage adjusted them.
         stages: the records of this session's stages, in order.
         seconds: time by step.
         session: which of the sessions solved together it is.
@@ -54,6 +56,7 @@ def assemble(
         rotations=as_given(rotations),
         translations=as_given(translations),
         points=as_given(points),
+        covariance=_covariance(covariance, cameras, session),
         residuals_px=as_given(residuals),
         inliers=measurements.by_frame(inliers),
         stick_lengths_m=as_given((points[:, ends] - points[:, starts]).norm(dim=-1)),
@@ -70,6 +73,11 @@ def assemble(
         seconds=dict(seconds),
         warnings=_warnings(observations, measurements, inliers, sigma_px),
     )
+
+
+def _covariance(covariance: Tensor | None, cameras: int, session: int) -> Tensor:
+    size = 6 * (cameras - 1)
+    return torch.full((size, size), torch.nan, dtype=torch.float64) if covariance is None else covariance[session]
 
 
 def _warnings(observations: Observations, measurements: Measurements, inliers: Tensor, sigma_px: Tensor) -> tuple[str, ...]:

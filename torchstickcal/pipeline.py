@@ -8,15 +8,17 @@ from pathlib import Path
 from typing import Any, Protocol
 
 import torch
+from torch import Tensor
 
 from torchstickcal.assemble import assemble
-from torchstickcal.config import Config, load_config
+from torchstickcal.config import Config, StickLengthSettings, load_config
 from torchstickcal.initialise import initialise
 from torchstickcal.observations import Observations
 from torchstickcal.problem import Measurements
 from torchstickcal.result import Calibration
 from torchstickcal.solvers import IterationRecord
 from torchstickcal.stages import StageRecord, StageResult, rulers, run_stage
+from torchstickcal.uncertainty import camera_covariance
 from torchstickcal.workers import on_worker
 
 
@@ -76,21 +78,30 @@ def _calibrated(observations: Observations, settings: Config, callback: Callback
     state = initialise(measurements, settings.initialise, labels)
     seconds = {"initialise": time.perf_counter() - began}
 
-    reached: StageResult | None = None
+    reached = adjusted = None
     records: list[StageRecord] = []
     listener = callback.on_iteration if callback else _ignore
     for name, stage in settings.stages.items():
         reached = run_stage(name, stage, measurements, state, known, settings.solver, listener)
         state = reached.state
+        adjusted = reached if stage.cameras == "free" else adjusted
         records += reached.records
         seconds[name] = records[-1].seconds
     assert reached is not None
+    covariance = adjusted and _covariance(measurements, adjusted, reached.sigma_px)
     seconds["total"] = time.perf_counter() - began
 
-    calibration = assemble(observations, measurements, reached, records, seconds)
+    calibration = assemble(observations, measurements, reached, covariance, records, seconds)
     if callback:
         callback.on_end(calibration)
     return calibration
+
+
+def _covariance(measurements: Measurements, adjusted: StageResult, sigma_px: Tensor) -> Tensor:
+    """The cameras' covariance where they were adjusted, for the noise found since."""
+    length = adjusted.losses.get("stick_length")
+    sigma_m = length.sigma if length is not None and length.weight == 1.0 else StickLengthSettings().sigma_m
+    return camera_covariance(measurements.keeping(adjusted.inliers), adjusted.state, sigma_px, sigma_m)
 
 
 def _ignore(record: IterationRecord) -> None:

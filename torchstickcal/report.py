@@ -14,12 +14,17 @@ def table(calibration: Calibration) -> str:
     cameras = zip(
         calibration.camera_names,
         calibration.camera_centres.tolist(),
+        calibration.camera_std_m.tolist(),
+        calibration.camera_std_deg.tolist(),
         calibration.reprojection_median_px.tolist(),
         _keypoints_used(calibration),
         strict=True,
     )
-    rows = [["camera", "centre x, y, z (m)", "reprojection (px)", "keypoints"]]
-    rows += [[name, " ".join(f"{v:8.4f}" for v in centre), f"{px:.3f}", str(used)] for name, centre, px, used in cameras]
+    rows = [["camera", "centre x, y, z (m)", "+- mm", "+- deg", "reprojection (px)", "keypoints"]]
+    rows += [
+        [name, " ".join(f"{v:8.4f}" for v in centre), f"{1000 * std_m:.2f}", f"{std_deg:.4f}", f"{px:.3f}", str(used)]
+        for name, centre, std_m, std_deg, px, used in cameras
+    ]
     text = [_aligned(rows), ""]
     if calibration.sticks:
         rows = [["stick", "given (m)", "mean (m)", "spread (mm)", "frames"]]
@@ -52,14 +57,18 @@ def summary(calibration: Calibration) -> dict[str, Any]:
                 "centre_m": centre,
                 "rotation": rotation,
                 "translation_m": translation,
+                "centre_std_m": std_m,
+                "rotation_std_deg": std_deg,
                 "reprojection_median_px": median_px,
                 "keypoints": keypoints,
             }
-            for name, centre, rotation, translation, median_px, keypoints in zip(
+            for name, centre, rotation, translation, std_m, std_deg, median_px, keypoints in zip(
                 calibration.camera_names,
                 calibration.camera_centres.tolist(),
                 calibration.rotations.tolist(),
                 calibration.translations.tolist(),
+                calibration.camera_std_m.tolist(),
+                calibration.camera_std_deg.tolist(),
                 calibration.reprojection_median_px.tolist(),
                 _keypoints_used(calibration),
                 strict=True,
@@ -69,6 +78,7 @@ def summary(calibration: Calibration) -> dict[str, Any]:
             {"name": _point_name(calibration, index), "sigma_px": sigma}
             for index, sigma in enumerate(calibration.sigma_px.tolist())
         ],
+        "scale_std": _finite(calibration.scale_std),
         "sticks": [
             {
                 "start": stick.start,

@@ -14,17 +14,20 @@ import torch
 from torch import Tensor
 
 from torchstickcal import se3
+from torchstickcal.cameras import Intrinsics
 from torchstickcal.errors import FileFormatError
 from torchstickcal.files import atomic_path
 from torchstickcal.observations import Stick
 from torchstickcal.solvers import IterationRecord, Stop
 from torchstickcal.stages import StageRecord
+from torchstickcal.uncertainty import centre_covariances, point_covariances, relative_scale_std
 
-_FORMAT = "torchstickcal calibration 1"
+_FORMAT = "torchstickcal calibration 2"
 _TENSORS = (
     "rotations",
     "translations",
     "points",
+    "covariance",
     "residuals_px",
     "inliers",
     "stick_lengths_m",
@@ -47,6 +50,9 @@ class Calibration:
     """(C, 3), world to camera, metres"""
     points: Tensor
     """(F, P, 3), metres; NaN where fewer than two cameras saw the point"""
+    covariance: Tensor
+    """(6 (C - 1), 6 (C - 1)), float64, of the tangents (translation, rotation; metres, radians) of all cameras but the first,
+    which is the world: ``T_true = T Exp(tangent)``. For sticks whose lengths are as given, and normal noise."""
     residuals_px: Tensor
     """(C, F, P, 2), projection minus keypoint, pixels, of inliers and outliers; NaN where not seen or the point not known"""
     inliers: Tensor
@@ -94,6 +100,53 @@ class Calibration:
         return se3.camera_centres(self.rotations, self.translations) + 0.0
 
     @property
+    def camera_std_deg(self) -> Tensor:
+        """(C,), standard deviation of each camera's rotation angle relative to the first camera, degrees."""
+        variances = self.covariance.diagonal().unflatten(0, (-1, 6))[:, 3:].sum(1)
+        return torch.nn.functional.pad(variances.sqrt().rad2deg(), (1, 0)).to(self.rotations.dtype)
+
+    @property
+    def camera_std_m(self) -> Tensor:
+        """(C,), standard deviation of the distance of each camera's centre from where it is, in the first camera's frame."""
+        covariances = centre_covariances(self.camera_centres.double(), self.covariance)
+        return covariances.diagonal(dim1=1, dim2=2).sum(1).sqrt().to(self.rotations.dtype)
+
+    @property
+    def scale_std(self) -> Tensor:
+        """(), standard deviation of the rig's scale as a share of it, the sticks' lengths being as given."""
+        return relative_scale_std(self.camera_centres.double(), self.covariance).to(self.rotations.dtype)
+
+    @property
+    def points_std_m(self) -> Tensor:
+        """(F, P), standard deviation of the distance of each point from where it is, stick lengths and smoothness aside."""
+        frames, points = self.points.shape[:2]
+        sigma_px = self.sigma_px.double().expand(frames, points).flatten()
+        found = self._point_covariances(self.points.double().flatten(0, 1), self.inliers.flatten(1), sigma_px)
+        return found.diagonal(dim1=1, dim2=2).sum(1).sqrt().to(self.points.dtype).view(frames, points)
+
+    def predict_std(self, points: Tensor, sigma_px: float | None = None) -> Tensor:
+        """How well points would be triangulated: standard deviations (..., 3) along the axes, metres.
+
+        A point counts as seen by every camera that has it in front of it and, where the image sizes are known, in its image.
+
+        Args:
+            points: (..., 3), metres, in the frame of the first camera.
+            sigma_px: noise of their keypoints along an axis, pixels; None for the median over the calibration's points.
+
+        Returns:
+            Standard deviations with the cameras' uncertainty in them; NaN where fewer than two cameras see the point.
+        """
+        flat = points.detach().double().reshape(-1, 3).to(self.points.device)
+        moved = se3.moved(self.rotations.double()[None], self.translations.double()[None], flat.mT[None])[0]
+        visible = moved[:, 2] > 0
+        if self.image_size is not None:
+            pixels = self._cameras().project(moved.movedim(1, -1))
+            visible = visible & ((pixels >= 0) & (pixels < self.image_size[:, None].to(pixels.device))).all(-1)
+        sigma = flat.new_full(flat.shape[:1], float(self.sigma_px.median()) if sigma_px is None else sigma_px)
+        found = self._point_covariances(flat, visible, sigma)
+        return found.diagonal(dim1=1, dim2=2).sqrt().to(points.dtype).view(points.shape)
+
+    @property
     def reprojection_rms_px(self) -> Tensor:
         """(C,), root mean square over the inliers of each camera of the residuals' lengths, pixels."""
         return self._inlier_distances().square().nanmean(1).sqrt()
@@ -102,6 +155,13 @@ class Calibration:
     def reprojection_median_px(self) -> Tensor:
         """(C,), median over the inliers of each camera of the residuals' lengths, pixels."""
         return self._inlier_distances().nanmedian(1).values
+
+    def _cameras(self) -> Intrinsics:
+        return Intrinsics(self.intrinsics.double(), None if self.distortion is None else self.distortion.double(), self.fisheye)
+
+    def _point_covariances(self, points: Tensor, visible: Tensor, sigma_px: Tensor) -> Tensor:
+        poses = self.rotations.double(), self.translations.double()
+        return point_covariances(points, visible, sigma_px, poses, self._cameras(), self.covariance)
 
     def _inlier_distances(self) -> Tensor:
         return self.residuals_px.norm(dim=-1).where(self.inliers, torch.nan).flatten(1)
