@@ -35,7 +35,7 @@ class Pair:
     common: int
     """points both cameras see, over all frames"""
     inliers: int
-    """those that agree with the essential matrix"""
+    """those that agree with the essential matrix and lie in front of both cameras, as those of a wrong one need not"""
     poses: tuple[RelativePose, ...]
     """the four poses, the one with most points in front of both cameras first"""
 
@@ -63,8 +63,9 @@ def relate(views: Views, first: int, second: int, *, max_points: int, threshold_
         return Pair(len(columns), 0, ())
     inliers = np.flatnonzero(_sampson_distance(essential, a, b) < threshold)
     sample = inliers[spread(len(inliers), max_points)]
-    count = round(len(columns) * len(inliers) / a.shape[1])
-    return Pair(len(columns), count, _decompose(essential, a[:, sample], b[:, sample]))
+    poses = _decompose(essential, a[:, sample], b[:, sample])
+    in_front = poses[0].in_front / max(1, len(sample))
+    return Pair(len(columns), round(len(columns) * in_front * len(inliers) / a.shape[1]), poses)
 
 
 def two_view_depths(rotation: Array, translation: Array, a: Array, b: Array) -> tuple[Array, Array]:
