@@ -11,6 +11,8 @@ cameras together, of fresh points that the calibrated cameras triangulate, and o
 share of true values inside the 95 % ellipsoid (of all cameras; of each fresh point) or interval (each coordinate of a fresh
 point, by ``predict_std``).
 
+A run in which most keypoints of some camera were set aside is lost, as its user can see; lost runs are counted and left out.
+
 Efficiency. Mean squared error of the camera centres and rotations, in the first camera's frame, over that of the Cramer-Rao
 bound for those who know the inliers, their noise and the stick's length exactly. "Less luck" removes the luck of the draw:
 the linear estimate that attains the bound is computed from the same keypoints, and its surplus over the bound subtracted.
@@ -67,6 +69,7 @@ class Squared(NamedTuple):
 class Run(NamedTuple):
     """What one run contributes: means over its cameras or points, and sums of squares."""
 
+    lost: bool
     cameras: float
     cameras_inside: float
     points: float
@@ -91,14 +94,15 @@ def main() -> None:
     for share in options.outliers:
         for rig in RIGS:
             spec = replace(rig, regimes=(Noise(SIGMA_PX, outliers=share),))
-            runs = [one_run(replace(spec, seed=seed), config) for seed in range(options.runs)]
-            label = f"| {rig.cameras} | {rig.name} | {share:.0%} | {options.runs} | "
+            every = [one_run(replace(spec, seed=seed), config) for seed in range(options.runs)]
+            runs = [run for run in every if not run.lost]
+            label = f"| {rig.cameras} | {rig.name} | {share:.0%} | {len(every)} | {len(every) - len(runs)} | "
             honesty.append(label + _honesty(runs))
             efficiency.append(label + _efficiency(runs))
-    first = "| cameras | action, layout | outliers | runs | "
-    print(first + "cameras e2/n | inside | points e2/n | inside | coordinates inside | own points e2/n |\n" + "|---" * 10 + "|")
+    first = "| cameras | action, layout | outliers | runs | lost | "
+    print(first + "cameras e2/n | inside | points e2/n | inside | coordinates inside | own points e2/n |\n" + "|---" * 11 + "|")
     print("\n".join(honesty))
-    print("\n" + first + "centres / bound | less luck | rotations / bound | less luck |\n" + "|---" * 8 + "|")
+    print("\n" + first + "centres / bound | less luck | rotations / bound | less luck |\n" + "|---" * 9 + "|")
     print("\n".join(efficiency))
 
 
@@ -114,6 +118,7 @@ def one_run(spec: SessionSpec, config: dict[str, object]) -> Run:
     best, covariance = best_estimate(session, truth)
     centres = se3.camera_centres(*truth)
     return Run(
+        lost=bool((calibration.inliers.sum((1, 2)) < session.observations.visible.sum((1, 2)) / 2).any()),
         cameras=squared / len(error),
         cameras_inside=float(squared < chi_square_quantile(0.95, len(error))),
         points=float(points.mean()) / 3,
@@ -218,13 +223,13 @@ def _with_stick_sigma(sigma_m: float) -> dict[str, object]:
 
 
 def _honesty(runs: Sequence[Run]) -> str:
-    columns = torch.tensor([run[:6] for run in runs], dtype=torch.float64).mT
+    columns = torch.tensor([run[1:7] for run in runs], dtype=torch.float64).mT
     shares = (False, True, False, True, True, False)
     return " | ".join(_mean(values, share) for values, share in zip(columns, shares, strict=True)) + " |"
 
 
 def _efficiency(runs: Sequence[Run]) -> str:
-    found, best, bound = (torch.tensor([run[column] for run in runs], dtype=torch.float64).mT for column in (6, 7, 8))
+    found, best, bound = (torch.tensor([run[column] for run in runs], dtype=torch.float64).mT for column in (7, 8, 9))
     pairs = [(_ratio(f, c), _ratio(f - b + c, c)) for f, b, c in zip(found, best, bound, strict=True)]
     return " | ".join(text for pair in pairs for text in pair) + " |"
 
