@@ -70,7 +70,7 @@ def main() -> None:
 
     one = _median(lambda: on_worker(keypoints.device, iteration), 10 * options.runs, keypoints)
     print(
-        f"\nbackward, tracks not smoothed: {1e3 * back:.1f} ms, {back / one:.1f} iterations of Gauss-Newton ({1e3 * one:.1f} ms)"
+        f"\nbackward, tracks not smoothed: {1e3 * back:.1f} ms, {back / one:.1f} Gauss-Newton iterations of {1e3 * one:.1f} ms"
     )
 
 
