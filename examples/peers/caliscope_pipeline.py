@@ -2,6 +2,7 @@
 
 ``calibrate_extrinsics`` as its application calls it: bootstrap, adjustment, robust refinement, filter, adjustment. Intrinsics
 are known and held; ``CALISCOPE_REFINE_INTRINSICS=1`` in the environment lets it refine them, as it does by default.
+``CALISCOPE_FILTER_PERCENTILE`` replaces the 2.5 % of the keypoints, those with the largest errors, that its filter drops.
 """
 
 from __future__ import annotations
@@ -19,6 +20,7 @@ from sessions import Found, NotCalibratedError, Session, main
 
 STICK_SIGMA_M = 0.001
 REFINE_INTRINSICS = os.environ.get("CALISCOPE_REFINE_INTRINSICS") == "1"
+FILTER_PERCENTILE = float(os.environ.get("CALISCOPE_FILTER_PERCENTILE", "2.5"))
 
 
 def calibrate(session: Session) -> Found:
@@ -30,7 +32,13 @@ def calibrate(session: Session) -> Found:
     stick = DistanceConstraint(0, session.stick[0], 0, session.stick[1], session.stick_length_m, STICK_SIGMA_M)
     points, cameras = _image_points(session), _cameras(session)
     began = time.perf_counter()
-    run = calibrate_extrinsics(points, cameras, ConstraintSet((stick,), frozenset()), refine_intrinsics=REFINE_INTRINSICS)
+    run = calibrate_extrinsics(
+        points,
+        cameras,
+        ConstraintSet((stick,), frozenset()),
+        refine_intrinsics=REFINE_INTRINSICS,
+        filter_percentile=FILTER_PERCENTILE,
+    )
     seconds = time.perf_counter() - began
     placed = run.capture_volume.camera_array.posed_cameras
     if len(placed) < len(session.keypoints):

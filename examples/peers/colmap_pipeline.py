@@ -1,9 +1,10 @@
 """COLMAP: geometric verification and incremental mapping; the scale from the stick afterwards.
 
 The rig stands still, so that a camera is one image whose features are its keypoints of all frames; a point of a frame seen by
-two cameras is a match. Intrinsics are known and held. Every other option is COLMAP's own; ``COLMAP_MAX_ERROR_PX`` in the
-environment replaces its 4 pixels, the largest error of an inlier. Timed are verification, mapping and scaling, without
-filling the database.
+two cameras is a match. Intrinsics are known and held. Points that only two cameras see are used: COLMAP ignores them
+unless told otherwise, and then refuses rigs of two cameras and loses the stick in rigs of three. Every other option is
+COLMAP's own; ``COLMAP_MAX_ERROR_PX`` in the environment replaces its 4 pixels, the largest error of an inlier. Timed are
+verification, mapping and scaling, without filling the database.
 """
 
 from __future__ import annotations
@@ -88,6 +89,7 @@ def _mapping_options() -> pycolmap.IncrementalPipelineOptions:
     )
     options.mapper.abs_pose_refine_focal_length = options.mapper.abs_pose_refine_extra_params = False
     options.mapper.init_max_error = options.mapper.filter_max_reproj_error = MAX_ERROR_PX
+    options.triangulation.ignore_two_view_tracks = False
     options.triangulation.merge_max_reproj_error = options.triangulation.complete_max_reproj_error = MAX_ERROR_PX
     return options
 
