@@ -1,0 +1,244 @@
+"""Is the covariance honest, and is the estimate as good as it can be? Statistics of many simulated sessions.
+
+    python examples/statistics_of_the_calibration.py                 # 2 runs of each: a few seconds
+    python examples/statistics_of_the_calibration.py --runs 500      # the tables of docs/uncertainty.md
+
+Every run draws a motion, the random part of a rig, keypoint noise of 1 px and, where the table says so, gross errors of up to
+150 px along each axis. Printed with their standard errors over the runs:
+
+Honesty. e2/n is the squared error in units of the covariance per degree of freedom, 1 where the covariance is honest: of all
+cameras together, of fresh points that the calibrated cameras triangulate, and of the session's own points. "Inside" is the
+share of true values inside the 95 % ellipsoid (of all cameras; of each fresh point) or interval (each coordinate of a fresh
+point, by ``predict_std``).
+
+Efficiency. Mean squared error of the camera centres and rotations, in the first camera's frame, over that of the Cramer-Rao
+bound for those who know the inliers, their noise and the stick's length exactly. "Less luck" removes the luck of the draw:
+the linear estimate that attains the bound is computed from the same keypoints, and its surplus over the bound subtracted.
+"""
+
+from __future__ import annotations
+
+import argparse
+import zlib
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from torchstickcal import Calibration, Observations, calibrate, se3
+from torchstickcal.config import InitialiseSettings
+from torchstickcal.initialise import triangulated
+from torchstickcal.losses import Loss, ReprojectionLoss, StickLengthLoss
+from torchstickcal.metrics import rotation_angle
+from torchstickcal.objective import Objective
+from torchstickcal.problem import Measurements, State
+from torchstickcal.simulate import Noise, SessionSpec, SimulatedSession
+from torchstickcal.solvers.newton import polish
+from torchstickcal.solvers.normal_equations import NormalEquations
+from torchstickcal.uncertainty import centre_covariances, point_covariances
+
+SIGMA_PX = 1.0
+EXACT_M = 1e-5
+RIGS = (
+    SessionSpec("golf, hemisphere", "golf", cameras=3, frames=40, fps=20.0),
+    SessionSpec("hockey, ring", "hockey", cameras=5, frames=40, fps=20.0, layout="ring"),
+    SessionSpec("baseball, arena", "baseball", cameras=8, frames=40, fps=20.0, layout="arena"),
+)
+FRESH_POINTS, FRESH_RADIUS_M, SCENE_CENTRE = 50, 0.9, (0.0, 0.0, 0.9)
+INTERVAL_95 = 1.959964
+
+
+class Poses(NamedTuple):
+    """World to camera, (C, 3, 3) and (C, 3), the first camera being the world."""
+
+    rotations: Tensor
+    translations: Tensor
+
+
+class Squared(NamedTuple):
+    """Summed squared errors of the cameras."""
+
+    centres_m2: float
+    rotations_rad2: float
+
+
+class Run(NamedTuple):
+    """What one run contributes: means over its cameras or points, and sums of squares."""
+
+    cameras: float
+    cameras_inside: float
+    points: float
+    points_inside: float
+    coordinates_inside: float
+    own_points: float
+    found: Squared
+    best: Squared
+    """of the linear estimate that attains the bound"""
+    bound: Squared
+
+
+def main() -> None:
+    """Print the tables."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--runs", type=int, default=2)
+    parser.add_argument("--outliers", type=float, nargs="+", default=[0.0, 0.1], help="shares of gross errors")
+    parser.add_argument("--stick-sigma-m", type=float, default=0.001, help="how well the calibration takes the length to hold")
+    options = parser.parse_args()
+    config = _with_stick_sigma(options.stick_sigma_m)
+    honesty, efficiency = [], []
+    for share in options.outliers:
+        for rig in RIGS:
+            spec = replace(rig, regimes=(Noise(SIGMA_PX, outliers=share),))
+            runs = [one_run(replace(spec, seed=seed), config) for seed in range(options.runs)]
+            label = f"| {rig.cameras} | {rig.name} | {share:.0%} | {options.runs} | "
+            honesty.append(label + _honesty(runs))
+            efficiency.append(label + _efficiency(runs))
+    first = "| cameras | action, layout | outliers | runs | "
+    print(first + "cameras e2/n | inside | points e2/n | inside | coordinates inside | own points e2/n |\n" + "|---" * 10 + "|")
+    print("\n".join(honesty))
+    print("\n" + first + "centres / bound | less luck | rotations / bound | less luck |\n" + "|---" * 8 + "|")
+    print("\n".join(efficiency))
+
+
+def one_run(spec: SessionSpec, config: dict[str, object]) -> Run:
+    """Simulate, calibrate, compare with the truth."""
+    session = spec.generate()
+    calibration = calibrate(session.observations, config)
+    truth = true_poses(session)
+    error = deviation(calibration, truth)
+    squared = float(error @ torch.linalg.solve(calibration.covariance, error))
+    points, coordinates = errors_of_fresh_points(calibration, session, truth)
+    own = (calibration.points - true_points(session)).square().sum(-1) / calibration.points_std_m.square()
+    best, covariance = best_estimate(session, truth)
+    centres = se3.camera_centres(*truth)
+    return Run(
+        cameras=squared / len(error),
+        cameras_inside=float(squared < chi_square_quantile(0.95, len(error))),
+        points=float(points.mean()) / 3,
+        points_inside=float((points < chi_square_quantile(0.95, 3)).double().mean()),
+        coordinates_inside=float((coordinates.abs() < INTERVAL_95).double().mean()),
+        own_points=float(own.nanmean()),
+        found=squared_errors(Poses(calibration.rotations, calibration.translations), truth),
+        best=squared_errors(best, truth),
+        bound=Squared(
+            float(centre_covariances(centres, covariance).diagonal(dim1=1, dim2=2).sum()),
+            float(covariance.diagonal().view(-1, 6)[:, 3:].sum()),
+        ),
+    )
+
+
+def true_poses(session: SimulatedSession) -> Poses:
+    """The true poses in the first camera's frame."""
+    truth = session.truth
+    rotations = truth.rotations @ truth.rotations[0].mT
+    return Poses(rotations, truth.translations - rotations @ truth.translations[0])
+
+
+def true_points(session: SimulatedSession) -> Tensor:
+    """The true points (F, P, 3) in the first camera's frame."""
+    truth = session.truth
+    assert truth.points is not None
+    return truth.points @ truth.rotations[0].mT + truth.translations[0]
+
+
+def deviation(calibration: Calibration, truth: Poses) -> Tensor:
+    """Tangents (6 (C - 1),) that lead from the estimated poses to the true ones, to first order."""
+    back = calibration.rotations.mT
+    rotation = se3.vee(back @ truth.rotations)
+    shift = (back @ (truth.translations - calibration.translations)[..., None])[..., 0]
+    return torch.cat([shift, rotation], dim=1)[1:].flatten()
+
+
+def squared_errors(poses: Poses, truth: Poses) -> Squared:
+    """Of centres and rotation angles, in the first camera's frame."""
+    centres = se3.camera_centres(*poses) - se3.camera_centres(*truth)
+    angles = rotation_angle(poses.rotations @ truth.rotations.mT)
+    return Squared(float(centres.square().sum()), float(angles.square().sum()))
+
+
+def errors_of_fresh_points(calibration: Calibration, session: SimulatedSession, truth: Poses) -> tuple[Tensor, Tensor]:
+    """Errors of fresh points: squared, in units of the covariance (N,), and by coordinate, of ``predict_std`` (N, 3)."""
+    generator = torch.Generator().manual_seed(zlib.crc32(session.observations.keypoints.numpy().tobytes()))
+    direction = torch.nn.functional.normalize(torch.randn(FRESH_POINTS, 3, generator=generator, dtype=torch.float64), dim=1)
+    distance = FRESH_RADIUS_M * torch.rand(FRESH_POINTS, 1, generator=generator, dtype=torch.float64) ** (1 / 3)
+    world = torch.tensor(SCENE_CENTRE, dtype=torch.float64) + distance * direction
+    points = world @ session.truth.rotations[0].mT + session.truth.translations[0]
+    lenses = session.observations.cameras
+    seen = lenses.project((truth.rotations @ points.mT + truth.translations[..., None]).mT)
+    keypoints = seen + SIGMA_PX * torch.randn(seen.shape, generator=generator, dtype=torch.float64)
+    poses = Poses(calibration.rotations, calibration.translations)
+    found = triangulated_by_least_squares(keypoints, poses, session.observations)
+    sigma_px = calibration.sigma_px.median().expand(FRESH_POINTS)
+    visible = torch.ones(len(keypoints), FRESH_POINTS, dtype=torch.bool)
+    covariances = point_covariances(found, visible, sigma_px, poses, lenses, calibration.covariance)
+    error = points - found
+    squared = (error[:, None] @ torch.linalg.solve(covariances, error[..., None]))[:, 0, 0]
+    return squared, error / calibration.predict_std(found)
+
+
+def triangulated_by_least_squares(keypoints: Tensor, poses: Poses, observations: Observations) -> Tensor:
+    """Points (N, 3) of keypoints (C, N, 2) by least squares in the image, the cameras held."""
+    measurements = Measurements.of(Observations(keypoints[:, :, None], observations.intrinsics, []))
+    rotations, translations = poses.rotations[None], poses.translations[None]
+    start = State(rotations, translations, triangulated(measurements, rotations, translations, InitialiseSettings()))
+    return polish(Objective(measurements, {"reprojection": ReprojectionLoss()}), start, cameras_free=False).points[0].mT
+
+
+def best_estimate(session: SimulatedSession, truth: Poses) -> tuple[Poses, Tensor]:
+    """The linear estimate at the truth from the inliers, and its covariance: the least of any unbiased estimate's."""
+    points = true_points(session).flatten(0, 1).mT.contiguous()
+    state = State(truth.rotations[None], truth.translations[None], points[None])
+    measurements = Measurements.of(session.observations).keeping(torch.from_numpy(session.inliers).flatten(1)[None])
+    losses: dict[str, Loss] = {"reprojection": ReprojectionLoss(SIGMA_PX), "stick_length": StickLengthLoss(EXACT_M)}
+    system = NormalEquations(Objective(measurements, losses), state, cameras_free=True)
+    step = system.step()
+    found = state.retracted(step.cameras, step.points)
+    return Poses(found.rotations[0], found.translations[0]), torch.linalg.inv(system.reduced[0])
+
+
+def chi_square_quantile(probability: float, freedom: int) -> float:
+    """Where the chi-square distribution function reaches a probability, by bisection of the incomplete gamma function.
+
+    The tables have 7.815, 21.026, 36.415 and 58.124 for 0.95 and 3, 12, 24 and 42 degrees of freedom.
+    """
+    low, high = 0.0, 10.0 * freedom + 100.0
+    half = torch.tensor(freedom / 2, dtype=torch.float64)
+    for _ in range(60):
+        middle = (low + high) / 2
+        below = float(torch.special.gammainc(half, half.new_tensor(middle / 2))) < probability
+        low, high = (middle, high) if below else (low, middle)
+    return (low + high) / 2
+
+
+def _with_stick_sigma(sigma_m: float) -> dict[str, object]:
+    stages = ("metric", "refined", "trajectories")
+    return {"extends": "default", "stages": {stage: {"stick_length": {"sigma_m": sigma_m}} for stage in stages}}
+
+
+def _honesty(runs: Sequence[Run]) -> str:
+    columns = torch.tensor([run[:6] for run in runs], dtype=torch.float64).mT
+    shares = (False, True, False, True, True, False)
+    return " | ".join(_mean(values, share) for values, share in zip(columns, shares, strict=True)) + " |"
+
+
+def _efficiency(runs: Sequence[Run]) -> str:
+    found, best, bound = (torch.tensor([run[column] for run in runs], dtype=torch.float64).mT for column in (6, 7, 8))
+    pairs = [(_ratio(f, c), _ratio(f - b + c, c)) for f, b, c in zip(found, best, bound, strict=True)]
+    return " | ".join(text for pair in pairs for text in pair) + " |"
+
+
+def _mean(values: Tensor, share: bool) -> str:
+    mean, error = float(values.mean()), float(values.std()) / len(values) ** 0.5
+    return f"{100 * mean:.1f} ± {100 * error:.1f} %" if share else f"{mean:.3f} ± {error:.3f}"
+
+
+def _ratio(found: Tensor, bound: Tensor) -> str:
+    """The ratio of the means and its standard error."""
+    ratio = found.mean() / bound.mean()
+    return f"{ratio:.3f} ± {float((found - ratio * bound).std() / bound.mean()) / len(found) ** 0.5:.3f}"
+
+
+if __name__ == "__main__":
+    main()
