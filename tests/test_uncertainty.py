@@ -71,7 +71,8 @@ def test_a_point_is_as_uncertain_as_its_rays_and_its_cameras():
         rotations, translations = (torch.cat([v[:1], w]) for v, w in zip(poses, turned, strict=True))
         return lens.project((rotations @ point[0] + translations)[:, None])
 
-    jacobian = torch.autograd.functional.jacobian(lambda p: pixels(p, torch.zeros(18, dtype=torch.float64)), point).flatten(0, 2).flatten(1)
+    by_point = torch.autograd.functional.jacobian(lambda p: pixels(p, still[0]), point)
+    jacobian = by_point.flatten(0, 2).flatten(1)
     expected = torch.linalg.inv(jacobian.mT @ jacobian / 4)
     (found,) = point_covariances(point, visible, sigma, poses, lens, still)
     torch.testing.assert_close(found, expected)

@@ -1,17 +1,13 @@
-"""Calibrate a session with Caliscope's distance constraint, for comparison: time and camera error.
+"""Caliscope: its whole extrinsic calibration, with the stick as its distance constraint.
 
-In an environment of its own: ``pip install caliscope``, then
-
-    torchstickcal demo --out demo
-    python examples/peers/caliscope_pipeline.py demo/session.npz
-
-The session is an .npz with truth, as torchstickcal writes it. The second of two runs is timed.
+``calibrate_extrinsics`` as its application calls it: bootstrap, adjustment, robust refinement, filter, adjustment. Intrinsics
+are known and held; ``CALISCOPE_REFINE_INTRINSICS=1`` in the environment lets it refine them, as it does by default.
+``CALISCOPE_FILTER_PERCENTILE`` replaces the 2.5 % of the keypoints, those with the largest errors, that its filter drops.
 """
 
 from __future__ import annotations
 
-import logging
-import sys
+import os
 import time
 
 import numpy as np
@@ -20,64 +16,56 @@ from caliscope.cameras.camera_array import CameraArray, CameraData
 from caliscope.core.calibrate_extrinsics import calibrate_extrinsics
 from caliscope.core.constraints import ConstraintSet, DistanceConstraint
 from caliscope.core.point_data import ImagePoints
+from sessions import Found, NotCalibratedError, Session, main
 
 STICK_SIGMA_M = 0.001
+REFINE_INTRINSICS = os.environ.get("CALISCOPE_REFINE_INTRINSICS") == "1"
+FILTER_PERCENTILE = float(os.environ.get("CALISCOPE_FILTER_PERCENTILE", "2.5"))
 
 
-def main() -> None:
-    """Print the seconds and the mean distance of camera centres after a rigid alignment."""
-    logging.disable(logging.CRITICAL)
-    session = np.load(sys.argv[1])
-    keypoints, fps = session["keypoints"], float(session["fps"])
-    camera, frame, point = np.nonzero(np.isfinite(keypoints).all(-1))
-    pixels = keypoints[camera, frame, point]
+def calibrate(session: Session) -> Found:
+    """Poses of all cameras.
+
+    Raises:
+        NotCalibratedError: if a camera is not placed.
+    """
+    stick = DistanceConstraint(0, session.stick[0], 0, session.stick[1], session.stick_length_m, STICK_SIGMA_M)
+    points, cameras = _image_points(session), _cameras(session)
+    began = time.perf_counter()
+    run = calibrate_extrinsics(
+        points,
+        cameras,
+        ConstraintSet((stick,), frozenset()),
+        refine_intrinsics=REFINE_INTRINSICS,
+        filter_percentile=FILTER_PERCENTILE,
+    )
+    seconds = time.perf_counter() - began
+    placed = run.capture_volume.camera_array.posed_cameras
+    if len(placed) < len(session.keypoints):
+        raise NotCalibratedError(f"{len(placed)} of {len(session.keypoints)} cameras placed")
+    found = [placed[index] for index in range(len(placed))]
+    rotations = np.stack([np.asarray(camera.rotation, dtype=float) for camera in found])
+    return Found(rotations, np.stack([np.asarray(camera.translation, dtype=float).ravel() for camera in found]), seconds)
+
+
+def _image_points(session: Session) -> ImagePoints:
+    camera, frame, point = np.nonzero(session.visible)
+    pixels = session.keypoints[camera, frame, point]
     table = {"sync_index": frame, "cam_id": camera, "object_id": 0, "keypoint_id": point}
-    table |= {
-        "img_loc_x": pixels[:, 0],
-        "img_loc_y": pixels[:, 1],
-        "obj_loc_x": np.nan,
-        "obj_loc_y": np.nan,
-        "obj_loc_z": np.nan,
-    }
-    points = ImagePoints(pd.DataFrame(table | {"frame_index": frame, "frame_time": frame / fps}))
-    matrices = np.broadcast_to(session["intrinsics"], (len(keypoints), 3, 3))
-    sizes = np.broadcast_to(session["image_size"], (len(keypoints), 2)).astype(int)
-    cameras = CameraArray(
+    table |= {"img_loc_x": pixels[:, 0], "img_loc_y": pixels[:, 1]}
+    table |= {"obj_loc_x": np.nan, "obj_loc_y": np.nan, "obj_loc_z": np.nan}
+    return ImagePoints(pd.DataFrame(table | {"frame_index": frame, "frame_time": frame / session.fps}))
+
+
+def _cameras(session: Session) -> CameraArray:
+    described = zip(session.sizes, session.matrices, session.distortion, strict=True)
+    return CameraArray(
         {
-            index: CameraData(
-                cam_id=index,
-                size=(int(sizes[index, 0]), int(sizes[index, 1])),
-                matrix=matrices[index].copy(),
-                distortions=session["distortion"][index],
-            )
-            for index in range(len(keypoints))
+            index: CameraData(cam_id=index, size=(int(width), int(height)), matrix=matrix.copy(), distortions=lens.copy())
+            for index, ((width, height), matrix, lens) in enumerate(described)
         }
     )
-    (start,), (end,), (length,) = session["stick_start"], session["stick_end"], session["stick_length_m"]
-    stick = DistanceConstraint(0, int(start), 0, int(end), float(length), STICK_SIGMA_M)
-    for _ in range(2):
-        began = time.perf_counter()
-        run = calibrate_extrinsics(points, cameras, ConstraintSet((stick,), frozenset()), refine_intrinsics=False)
-        seconds = time.perf_counter() - began
-    found = [run.capture_volume.camera_array.cameras[index] for index in range(len(keypoints))]
-    rotations = np.stack([np.asarray(camera.rotation) for camera in found])
-    translations = np.stack([np.asarray(camera.translation).ravel() for camera in found])
-    errors = centre_errors(centres(rotations, translations), centres(session["rotation"], session["translation"]))
-    print(f"{seconds:.2f} s, camera centres off by {1000 * errors.mean():.2f} mm")
-
-
-def centres(rotations: np.ndarray, translations: np.ndarray) -> np.ndarray:
-    """Camera centres of poses world to camera."""
-    return -np.einsum("cji,cj->ci", rotations, translations)
-
-
-def centre_errors(estimated: np.ndarray, true: np.ndarray) -> np.ndarray:
-    """Distances after the rotation and translation of least squares."""
-    a, b = estimated - estimated.mean(0), true - true.mean(0)
-    u, _, vh = np.linalg.svd(b.T @ a)
-    rotation = u @ np.diag([1, 1, np.linalg.det(u @ vh)]) @ vh
-    return np.linalg.norm(a @ rotation.T - b, axis=1)
 
 
 if __name__ == "__main__":
-    main()
+    main(calibrate, __doc__)

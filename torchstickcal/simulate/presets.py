@@ -188,8 +188,8 @@ def golf_session(cameras: int = 6, frames: int = 240, noise: Noise | None = None
     """
     lens = Lens(focal_px=1200.0, distortion=_VIDEO.distortion)
     spec = SessionSpec(
-        name="golf", sport="golf", seed=seed, cameras=cameras, frames=frames, fps=max(frames - 1, 1) / 2.4, layout="ring", lens=lens,
-        radius_m=4.5, regimes=() if noise is None else (noise,),
+        name="golf", sport="golf", seed=seed, cameras=cameras, frames=frames, fps=max(frames - 1, 1) / 2.4,
+        layout="ring", lens=lens, radius_m=4.5, regimes=() if noise is None else (noise,),
     )  # fmt: skip
     session = spec.generate()
     return session.observations, session.truth

@@ -156,10 +156,9 @@ class NormalEquations:
             Both parts of the solution, and (B,) whether the Hessian is positive definite.
         """
         reduced_rhs = camera_rhs.flatten(1)
-        for part, eliminated in self._eliminations():
-            if self._count:
-                rows, half = eliminated.reductions(self._points(part.columns), point_rhs[..., part.columns])
-                reduced_rhs = reduced_rhs - (rows @ half[..., None])[..., 0]
+        for part, eliminated in self._eliminations() if self._count else ():
+            rows, half = eliminated.reductions(self._points(part.columns), point_rhs[..., part.columns])
+            reduced_rhs = reduced_rhs - (rows @ half[..., None])[..., 0]
         factor, failed = torch.linalg.cholesky_ex(self.reduced)
         cameras = torch.cholesky_solve(reduced_rhs[..., None], factor)[..., 0].view_as(camera_rhs)
         points = torch.empty_like(point_rhs)

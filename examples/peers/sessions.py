@@ -1,0 +1,187 @@
+"""What the scripts of all peers share: sessions in, one JSON line of camera poses per session out.
+
+Plain NumPy, so that it runs in the environment of any peer. A session is calibrated in a process of its own that lives
+on to the next one, so that a session which takes too long can be ended; the first session of a process pays for what the
+peer loads when first used.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import logging
+import multiprocessing
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from multiprocessing.connection import Connection
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Session:
+    """What a peer is told; of C cameras, F frames, P points."""
+
+    name: str
+    keypoints: Array
+    """(C, F, P, 2) pixels, NaN where not seen"""
+    confidence: Array
+    """(C, F, P), the weight of a keypoint: its variance is divided by it"""
+    matrices: Array
+    """(C, 3, 3)"""
+    distortion: Array
+    """(C, 5), OpenCV's order"""
+    sizes: NDArray[np.int64]
+    """(C, 2), width and height"""
+    fps: float
+    stick: tuple[int, int]
+    """the points at its ends"""
+    stick_length_m: float
+
+    @property
+    def visible(self) -> NDArray[np.bool_]:
+        """(C, F, P)"""
+        return np.isfinite(self.keypoints).all(-1) & (self.confidence > 0)
+
+
+class Found(NamedTuple):
+    """What a peer hands back: poses world to camera, metres, and the seconds its calibration took."""
+
+    rotations: Array
+    """(C, 3, 3)"""
+    translations: Array
+    """(C, 3)"""
+    seconds: float
+    """wall time from keypoints in the peer's own form to poses in metres"""
+
+
+Calibrate = Callable[[Session], Found]
+
+
+class NotCalibratedError(Exception):
+    """A peer that says it cannot calibrate a session, or not all of its cameras."""
+
+
+def read(path: Path) -> Session:
+    """Read a session that ``torchstickcal simulate`` wrote, without its truth."""
+    with np.load(path, allow_pickle=False) as file:
+        data = {name: file[name] for name in file.files}
+    keypoints = data["keypoints"]
+    cameras = len(keypoints)
+    distortion = np.broadcast_to(data.get("distortion", np.zeros(5)), (cameras, np.shape(data.get("distortion", [0] * 5))[-1]))
+    return Session(
+        name=path.stem,
+        keypoints=keypoints,
+        confidence=data.get("confidence", np.ones(keypoints.shape[:3])),
+        matrices=np.broadcast_to(data["intrinsics"], (cameras, 3, 3)).copy(),
+        distortion=distortion.copy(),
+        sizes=np.broadcast_to(data["image_size"], (cameras, 2)).astype(int),
+        fps=float(data.get("fps", 30.0)),
+        stick=(int(data["stick_start"][0]), int(data["stick_end"][0])),
+        stick_length_m=float(data["stick_length_m"][0]),
+    )
+
+
+def stick_scale(session: Session, points: Array) -> float:
+    """Known over median reconstructed length of the stick, of points (F, P, 3), NaN where not known.
+
+    Raises:
+        NotCalibratedError: if no frame has both ends.
+    """
+    start, end = session.stick
+    lengths = np.linalg.norm(points[:, end] - points[:, start], axis=-1)
+    if not np.isfinite(lengths).any():
+        raise NotCalibratedError("the stick is in no frame of the reconstruction")
+    return session.stick_length_m / float(np.nanmedian(lengths))
+
+
+def session_files(paths: list[Path]) -> list[Path]:
+    """The sessions among files and in folders, by name."""
+    return [file for path in paths for file in (sorted(path.glob("*.npz")) if path.is_dir() else [path])]
+
+
+def main(calibrate: Calibrate, describe: str | None) -> None:
+    """The command line of a peer: sessions to ``--out``, one JSON line each, shown as they come."""
+    parser = arguments(describe)
+    parser.add_argument("--out", type=Path, required=True, help="JSON lines, appended to")
+    options = parser.parse_args()
+    with options.out.open("a", encoding="utf-8") as out:
+        for line in measured(calibrate, session_files(options.sessions), options.timeout, options.repeats):
+            out.write(json.dumps(line) + "\n")
+            out.flush()
+            print(f"{line['name']:40} {line['seconds']:8.2f} s  {line['status']}", flush=True)
+
+
+def arguments(describe: str | None) -> argparse.ArgumentParser:
+    """What every script takes."""
+    parser = argparse.ArgumentParser(description=describe, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("sessions", type=Path, nargs="+", help="files, or folders of them")
+    parser.add_argument("--timeout", type=float, default=120.0, help="seconds after which a session is given up (120)")
+    parser.add_argument("--repeats", type=int, default=1, help="times that every session is calibrated (1)")
+    return parser
+
+
+def measured(calibrate: Calibrate, files: list[Path], timeout: float, repeats: int) -> Iterator[dict[str, Any]]:
+    """Calibrate sessions one after another; for each its name, seconds, status, and the poses if there are any."""
+    worker: _Worker | None = None
+    for file in [file for file in files for _ in range(repeats)]:
+        worker = worker or _Worker(calibrate)
+        began = time.perf_counter()
+        answer = worker.ask(file, timeout)
+        if answer is None:
+            worker = None
+            answer = {"seconds": time.perf_counter() - began, "status": f"time-out after {timeout:g} s"}
+        yield {"name": file.stem} | answer
+    if worker:
+        worker.end()
+
+
+class _Worker:
+    """A process that calibrates one session after another."""
+
+    def __init__(self, calibrate: Calibrate) -> None:
+        context = multiprocessing.get_context("fork")
+        self._connection, theirs = context.Pipe()
+        self._process = context.Process(target=_serve, args=(calibrate, theirs), daemon=True)
+        self._process.start()
+
+    def ask(self, file: Path, timeout: float) -> dict[str, Any] | None:
+        """The answer; None, and the process ended, if it takes too long."""
+        self._connection.send(file)
+        if self._connection.poll(timeout):
+            try:
+                return self._connection.recv()
+            except EOFError:
+                self._process.join()
+                return {"seconds": 0.0, "status": f"process died, exit code {self._process.exitcode}"}
+        self.end()
+        return None
+
+    def end(self) -> None:
+        """End the process."""
+        self._process.kill()
+        self._process.join()
+
+
+def _serve(calibrate: Calibrate, connection: Connection) -> None:
+    logging.disable(logging.CRITICAL)
+    while True:
+        session = read(connection.recv())
+        began = time.perf_counter()
+        try:
+            found = calibrate(session)
+        except Exception as error:
+            seconds = time.perf_counter() - began
+            connection.send({"seconds": seconds, "status": f"{type(error).__name__}: {error}".splitlines()[0][:200]})
+            continue
+        if not (np.isfinite(found.rotations).all() and np.isfinite(found.translations).all()):
+            connection.send({"seconds": found.seconds, "status": "poses are not finite"})
+            continue
+        poses = {"rotations": found.rotations.tolist(), "translations": found.translations.tolist()}
+        connection.send({"seconds": found.seconds, "status": "done"} | poses)
