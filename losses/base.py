@@ -10,13 +10,18 @@ from __future__ import annotations
 
 import copy
 from abc import ABC, abstractmethod
+from collections.abc import Callable
 from typing import NamedTuple, Self
 
 import torch
 from torch import Tensor, nn
 
-from torchstickcal.cameras import Intrinsics
+from torchstickcal.cameras import Intrinsics, PixelMap
 from torchstickcal.losses.robust import Quadratic, RobustKernel
+
+UnknownColumns = Callable[[Tensor, Tensor, PixelMap], tuple[Tensor, Tensor]]
+"""Derivatives of projections (x, y), each (..., C, k, N), by what is unknown of the cameras beside their poses, of normalised
+coordinates (..., C, N) and the pixels there."""
 
 
 class Loss(nn.Module):
@@ -55,6 +60,17 @@ class Loss(nn.Module):
         return self.sigma.to(like).square().reciprocal()
 
 
+class UnknownTerms(NamedTuple):
+    """A camera-point loss, linearised by k unknowns of each of C cameras, beside its pose."""
+
+    gradient: Tensor
+    """(..., C, k): half the derivative"""
+    hessian: Tensor
+    """(..., C, k, k): the Gauss-Newton block"""
+    coupling: Tensor
+    """(..., C, k, 3, N): the block with the point, in the world's axes"""
+
+
 class CameraPointTerms(NamedTuple):
     """A camera-point loss, linearised at C cameras and N points."""
 
@@ -68,6 +84,8 @@ class CameraPointTerms(NamedTuple):
     """(..., C, 3, N): half the derivative by the point, in the world's axes"""
     hessian: Tensor
     """(..., C, 6, N): the Gauss-Newton block J^T J by the point, entries xx xy xz yy yz zz"""
+    unknown: UnknownTerms | None
+    """the same by what else is unknown of the cameras"""
 
 
 class PairTerms(NamedTuple):
@@ -116,6 +134,7 @@ class CameraPointLoss(Loss, ABC):
         information: Tensor,
         cameras: Intrinsics,
         exact: bool = False,
+        by_unknowns: UnknownColumns | None = None,
     ) -> CameraPointTerms:
         """The terms at N points.
 
@@ -126,6 +145,7 @@ class CameraPointLoss(Loss, ABC):
             information: confidence / sigma^2, (..., C, N), zero where not seen.
             cameras: the C cameras.
             exact: whether the blocks are of the exact Hessian, with the curvature of kernel and projection.
+            by_unknowns: what else is unknown of the cameras.
         """
 
     @abstractmethod

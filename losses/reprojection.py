@@ -5,8 +5,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from torchstickcal.cameras import Intrinsics, inverse_depths
-from torchstickcal.losses.base import CameraPointLoss, CameraPointTerms
+from torchstickcal.cameras import Intrinsics, PixelMap, inverse_depths
+from torchstickcal.losses.base import CameraPointLoss, CameraPointTerms, UnknownColumns, UnknownTerms
 from torchstickcal.symmetric import symmetric_product
 
 
@@ -63,6 +63,7 @@ class ReprojectionLoss(CameraPointLoss):
         information: Tensor,
         cameras: Intrinsics,
         exact: bool = False,
+        by_unknowns: UnknownColumns | None = None,
     ) -> CameraPointTerms:
         # The derivative of (u, v) by the world point has the rows p / z and q / z, p = r1 - u r3 and q = r2 - v r3 with the
         # rows r of the rotation; M, the derivative of the pixel by (u, v), gives J^T W J = [p q] (M^T W M / z^2) [p q]^T.
@@ -110,6 +111,9 @@ class ReprojectionLoss(CameraPointLoss):
             weights=weights.sum(-1),
             gradient=gradient,
             hessian=hessian,
+            unknown=None
+            if by_unknowns is None
+            else _by_unknowns(by_unknowns(u, v, m), weights, rx, ry, m, p, q, inverse_depth),
         )
 
     def slope(self, points_cam: Tensor, moved_cam: Tensor, pixels: Tensor, information: Tensor, cameras: Intrinsics) -> Tensor:
@@ -122,6 +126,31 @@ class ReprojectionLoss(CameraPointLoss):
         rx, ry = m.x - pixels[..., 0, :], m.y - pixels[..., 1, :]
         weights = self.weight * information * self.kernel.weight((rx.square() + ry.square()) * information)
         return (weights * (rx * (m.dx_du * du + m.dx_dv * dv) + ry * (m.dy_du * du + m.dy_dv * dv))).sum()
+
+
+def _by_unknowns(
+    columns: tuple[Tensor, Tensor],
+    weights: Tensor,
+    rx: Tensor,
+    ry: Tensor,
+    m: PixelMap,
+    p: Tensor,
+    q: Tensor,
+    inverse_depth: Tensor,
+) -> UnknownTerms:
+    """The terms by columns (..., C, k, N): the gradient's with a column in place of the residual."""
+    ex, ey = columns
+    wx, wy = weights.unsqueeze(-2) * ex, weights.unsqueeze(-2) * ey
+    along_p, along_q = (
+        (by_x.unsqueeze(-2) * wx).addcmul_(by_y.unsqueeze(-2), wy) * inverse_depth.unsqueeze(-2)
+        for by_x, by_y in ((m.dx_du, m.dy_du), (m.dx_dv, m.dy_dv))
+    )
+    coupling = p.unsqueeze(-3) * along_p.unsqueeze(-2)
+    return UnknownTerms(
+        gradient=(wx @ rx.unsqueeze(-1) + wy @ ry.unsqueeze(-1))[..., 0],
+        hessian=wx @ ex.mT + wy @ ey.mT,
+        coupling=coupling.addcmul_(q.unsqueeze(-3), along_q.unsqueeze(-2)),
+    )
 
 
 def _scaled(weights: Tensor, a: Tensor, b: Tensor, c: Tensor, d: Tensor, factor: Tensor | None = None) -> Tensor:

@@ -11,7 +11,7 @@ ROOT = Path(__file__).parents[1]
 LAYERS = [
     ["errors", "files", "symmetric", "workers"],
     ["se3"],
-    ["cameras", "observations"],
+    ["cameras", "observations", "camera_unknowns"],
     ["losses"],
     ["config", "problem", "extrinsics"],
     ["objective"],

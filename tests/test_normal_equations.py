@@ -146,7 +146,8 @@ def test_exact_hessian_is_autograds(disturbed: tuple[Measurements, State], losse
 
     def solved(damping: float) -> torch.Tensor:
         system = NormalEquations(objective, state, True, damping, exact=True)
-        cameras, points, _ = system.solve(rhs[:18].view(1, 3, 6), rhs[18:].view(1, -1, 3).mT)
+        none = rhs.new_zeros(1, 0)
+        cameras, _, points, _ = system.solve(rhs[:18].view(1, 3, 6), none, rhs[18:].view(1, -1, 3).mT)
         return torch.cat([cameras.flatten(), points[0].mT.flatten()])
 
     damping = 0.5  # makes it definite away from the minimum

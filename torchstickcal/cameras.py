@@ -110,6 +110,20 @@ class Intrinsics:
             (vv,) = torch.autograd.grad(by_v.sum(), v)
         return uu, uv, vv
 
+    def pixels_by_radial(self, u: Tensor, v: Tensor, order: int) -> tuple[Tensor, Tensor]:
+        """Derivatives of the pixels of normalised coordinates (..., C, N) by the radial coefficient k1 (order 1) or k2."""
+        fx, skew, _, fy, _ = self._pixel_map(u.ndim)
+        r2 = u * u + v * v
+        if self.fisheye:
+            theta = r2.sqrt().atan()
+            growth = theta ** (2 * order) * theta / r2.clamp_min(1e-16).sqrt()
+        else:
+            growth = r2**order
+            if self._has_denominator:
+                *_, k4, k5, k6 = self._coefficients(u.ndim)
+                growth = growth / (1 + r2 * (k4 + r2 * (k5 + r2 * k6)))
+        return (fx * u + skew * v) * growth, fy * v * growth
+
     def distort(self, u: Tensor, v: Tensor) -> tuple[Tensor, Tensor]:
         """Apply the lenses to normalised coordinates, two tensors (..., C, ...)."""
         if self.distortion is None:

@@ -160,13 +160,15 @@ def _solved(
 ) -> Adjoint:
     """The system solved with as little damping as it takes."""
     dampings = torch.zeros(len(point_rhs), dtype=torch.float64, device=point_rhs.device)
-    cameras, points, solved = NormalEquations(objective, state, cameras_free, dampings, exact).solve(camera_rhs, point_rhs)
+    none = point_rhs.new_zeros(len(point_rhs), 0)
+    system = NormalEquations(objective, state, cameras_free, dampings, exact)
+    cameras, _, points, solved = system.solve(camera_rhs, none, point_rhs)
     for damping in _DAMPINGS[1:]:
         if bool(solved.all()):
             break
         dampings = dampings.where(solved, damping)
         system = NormalEquations(objective, state, cameras_free, dampings, exact)
-        cameras, points, solved = system.solve(camera_rhs, point_rhs)
+        cameras, _, points, solved = system.solve(camera_rhs, none, point_rhs)
     return Adjoint(cameras.where(solved[:, None, None], 0.0), points.where(solved[:, None, None], 0.0), solved)
 
 

@@ -7,15 +7,20 @@ loops, and linearised block by block, for the Gauss-Newton solver.
 from __future__ import annotations
 
 from collections.abc import Mapping
+from functools import partial
 from typing import TypeVar
 
 import torch
 from torch import Tensor
 
 from torchstickcal import se3
+from torchstickcal.camera_unknowns import Columns
 from torchstickcal.losses import CameraPointLoss, Loss, PairLoss, TrackLoss
 from torchstickcal.losses.base import CameraPointTerms, PairTerms, TrackTerms
-from torchstickcal.problem import Columns, Measurements, State
+from torchstickcal.problem import Measurements, State
+
+PRIOR = "prior"
+"""Name of the term that holds the cameras' further unknowns to what was given."""
 
 _Kind = TypeVar("_Kind", bound=Loss)
 
@@ -45,26 +50,35 @@ class Objective:
         """Whether a loss ties one frame to another."""
         return bool(self._track)
 
-    def terms(self, rotations: Tensor, translations: Tensor, points: Tensor) -> dict[str, Tensor]:
+    def terms(
+        self, rotations: Tensor, translations: Tensor, points: Tensor, unknowns: Tensor | None = None
+    ) -> dict[str, Tensor]:
         """The value of every loss, summed over the sessions, differentiable.
 
         Args:
             rotations: (B, C, 3, 3).
             translations: (B, C, 3).
             points: (B, F, P, 3).
+            unknowns: (B, K), what else is unknown of the cameras; None for cameras as given.
         """
         m = self.measurements
+        cameras, pixels = m.cameras, m.pixels
+        if m.unknowns is not None and unknowns is not None:
+            cameras = m.unknowns.applied(cameras, unknowns)
+            pixels = m.unknowns.displaced(pixels, unknowns, m.motion)
         confidence = m.by_frame(m.confidence)
-        keypoints = m.by_frame(m.pixels).movedim(2, -1).where(confidence[..., None] > 0, torch.nan)
+        keypoints = m.by_frame(pixels).movedim(2, -1).where(confidence[..., None] > 0, torch.nan)
         points = points.where(m.by_frame(m.active)[..., None], torch.nan)
         starts, ends = m.pairs.unbind(1)
         values: dict[str, Tensor] = {}
         for name, loss in self._camera_point.items():
-            values[name] = loss(points, rotations, translations, keypoints, m.cameras, confidence)
+            values[name] = loss(points, rotations, translations, keypoints, cameras, confidence)
         for name, loss in self._pair.items():
             values[name] = loss(points[..., starts, :], points[..., ends, :], m.lengths_m[:, None])
         for name, loss in self._track.items():
             values[name] = loss(points)
+        if m.unknowns is not None and unknowns is not None:
+            values[PRIOR] = (unknowns / m.unknowns.prior_sigma).square().sum()
         return values
 
     def slope(self, state: State, camera_step: Tensor, point_step: Tensor) -> Tensor:
@@ -88,17 +102,38 @@ class Objective:
             total = total + loss.slope(m.by_frame(state.points), m.by_frame(point_step), m.by_frame(m.active))
         return total
 
-    def linearise_chunk(self, state: State, columns: Columns, exact: bool = False) -> dict[str, CameraPointTerms]:
-        """The camera-point losses, linearised at some of the columns N."""
+    def linearise_chunk(
+        self, state: State, columns: Columns, exact: bool = False, by_unknowns: bool = True
+    ) -> dict[str, CameraPointTerms]:
+        """The camera-point losses, linearised at some of the columns N, if wanted by the cameras' further unknowns too."""
         m = self.measurements
-        pixels, confidence = m.pixels[..., columns], m.confidence[..., columns]
+        pixels, confidence = m.pixels_at(state, columns), m.confidence[..., columns]
         points_cam, rotations = state.in_cameras(columns, pixels.dtype), state.rotations.to(pixels.dtype)
+        cameras, further = m.cameras_at(state), None
+        if m.unknowns is not None and by_unknowns:
+            motion = m.motion and m.motion.at(columns)
+            further = partial(m.unknowns.columns, cameras=cameras, motion=motion)
         return {
             name: loss.linearise(
-                points_cam, rotations, pixels, confidence * self._information[name][..., columns], m.cameras_in_dtype, exact
+                points_cam,
+                rotations,
+                pixels,
+                confidence * self._information[name][..., columns],
+                cameras,
+                exact,
+                further,
             )
             for name, loss in self._camera_point.items()
         }
+
+    def linearise_prior(self, state: State) -> tuple[Tensor, Tensor, Tensor] | None:
+        """The prior of the cameras' further unknowns: its value (B,), half its gradient (B, K), and its information (B, K)."""
+        unknowns = self.measurements.unknowns
+        if unknowns is None:
+            return None
+        information = unknowns.prior_sigma.square().reciprocal()
+        values = torch.zeros_like(information) if state.unknowns is None else state.unknowns
+        return (information * values.square()).sum(1), information * values, information
 
     def linearise_pairs(self, state: State, exact: bool = False) -> dict[str, PairTerms]:
         """The pair losses, linearised."""

@@ -7,7 +7,7 @@ is a batch of one.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
 
@@ -15,14 +15,12 @@ import torch
 from torch import Tensor
 
 from torchstickcal import se3
+from torchstickcal.camera_unknowns import CameraUnknowns, Columns, ImageMotion
 from torchstickcal.cameras import Intrinsics
 from torchstickcal.observations import Observations
 
 _CHUNK_KEYPOINTS = {"cpu": 32_000, "cuda": 1_000_000}
 """Keypoints worked on at a time. What a CPU works on stays in its cache; elsewhere an operation should be worth its launch."""
-
-Columns = slice | Tensor
-"""Some of the columns N: a slice of whole frames, or indices."""
 
 
 @dataclass(frozen=True)
@@ -36,6 +34,8 @@ class Measurements:
         frames: F.
         pairs: (S, 2), the points that are ends of one stick.
         lengths_m: (B, S), the sticks' lengths.
+        unknowns: what is not known of the cameras beside their poses; None where that is nothing.
+        motion: of the keypoints, where clocks are among the unknowns.
     """
 
     pixels: Tensor
@@ -44,6 +44,8 @@ class Measurements:
     frames: int
     pairs: Tensor
     lengths_m: Tensor
+    unknowns: CameraUnknowns | None = None
+    motion: ImageMotion | None = None
 
     @staticmethod
     def of(observations: Observations, use: Collection[int] | None = None, dtype: torch.dtype = torch.float64) -> Measurements:
@@ -98,6 +100,8 @@ class Measurements:
             confidence=self.confidence[sessions],
             cameras=self.cameras[sessions],
             lengths_m=self.lengths_m[sessions],
+            unknowns=self.unknowns and self.unknowns[sessions],
+            motion=self.motion and ImageMotion(*(tensor[sessions] for tensor in self.motion)),
         )
 
     def keeping(self, kept: Tensor) -> Measurements:
@@ -111,18 +115,31 @@ class Measurements:
         Infinite where a keypoint is not seen or its point lies behind the camera.
         """
         squared = torch.empty_like(self.confidence)
+        cameras = self.cameras_at(state)
         for columns in self.chunks():
             x, y, z = state.in_cameras(columns, squared.dtype).unbind(-2)
-            px, py = self.cameras_in_dtype.project_components(x, y, z)
-            u, v = self.pixels[..., columns].unbind(-2)
+            px, py = cameras.project_components(x, y, z)
+            u, v = self.pixels_at(state, columns).unbind(-2)
             confidence = self.confidence[..., columns]
             distance = ((px - u).square() + (py - v).square()) * confidence
             squared[..., columns] = distance.where((confidence > 0) & (z > 0), torch.inf)
         return squared
 
+    def cameras_at(self, state: State) -> Intrinsics:
+        """The cameras as a state has them, in the dtype of the pixels."""
+        if self.unknowns is None or state.unknowns is None:
+            return self._cameras_in_dtype
+        return self.unknowns.applied(self.cameras, state.unknowns).to(self.pixels.dtype)
+
+    def pixels_at(self, state: State, columns: Columns = slice(None)) -> Tensor:
+        """Keypoints (B, C, 2, n) of some columns, on the clocks as a state has them."""
+        pixels = self.pixels[..., columns]
+        if self.unknowns is None or state.unknowns is None or self.motion is None:
+            return pixels
+        return self.unknowns.displaced(pixels, state.unknowns, self.motion.at(columns))
+
     @cached_property
-    def cameras_in_dtype(self) -> Intrinsics:
-        """The cameras in the dtype of the pixels."""
+    def _cameras_in_dtype(self) -> Intrinsics:
         return self.cameras.to(self.pixels.dtype)
 
     @cached_property
@@ -188,43 +205,61 @@ class Measurements:
 
 @dataclass(frozen=True)
 class State:
-    """The unknowns: rotations (B, C, 3, 3) and translations (B, C, 3) world to camera, points (B, 3, N), metres; float64."""
+    """What is looked for, in float64.
+
+    Args:
+        rotations: (B, C, 3, 3), world to camera.
+        translations: (B, C, 3), world to camera, metres.
+        points: (B, 3, N), metres.
+        unknowns: (B, K), values of the measurements' further unknowns; None for cameras as given.
+    """
 
     rotations: Tensor
     translations: Tensor
     points: Tensor
+    unknowns: Tensor | None = None
 
     @staticmethod
     def stack(states: Sequence[State]) -> State:
         """The states of several sessions as those of one batch."""
-        return State(*(torch.cat([getattr(state, field.name) for state in states]) for field in fields(State)))
+        return _each(lambda *tensors: torch.cat(tensors), *states)
 
     def __getitem__(self, sessions: slice) -> State:
         """Those of some of the sessions."""
-        return State(self.rotations[sessions], self.translations[sessions], self.points[sessions])
+        return _each(lambda tensor: tensor[sessions], self)
 
     def replaced(self, where: Tensor, other: State) -> State:
         """The state with some sessions (B,), True where, taken from another."""
-        return State(
-            torch.where(where[:, None, None, None], other.rotations, self.rotations),
-            torch.where(where[:, None, None], other.translations, self.translations),
-            torch.where(where[:, None, None], other.points, self.points),
-        )
+        return _each(lambda mine, theirs: torch.where(where.view(-1, *[1] * (mine.ndim - 1)), theirs, mine), self, other)
 
     def scaled(self, factors: Tensor) -> State:
         """The same scenes, each its factor (B,) times as large."""
         factor = factors[:, None, None]
         return replace(self, translations=self.translations * factor, points=self.points * factor)
 
-    def retracted(self, camera_step: Tensor, point_step: Tensor) -> State:
-        """The state after tangent steps (B, C - 1, 6) of all cameras but the first, or (B, 0, 6), and steps (B, 3, N)."""
-        rotations, translations = self.rotations, self.translations
+    def retracted(self, camera_step: Tensor, point_step: Tensor, unknown_step: Tensor | None = None) -> State:
+        """The state after a step.
+
+        Args:
+            camera_step: tangents (B, C - 1, 6) of all cameras but the first, or (B, 0, 6).
+            point_step: (B, 3, N).
+            unknown_step: (B, K), or (B, 0) for none.
+        """
+        rotations, translations, unknowns = self.rotations, self.translations, self.unknowns
         if camera_step.shape[1]:
             moved = se3.retract(rotations[:, 1:], translations[:, 1:], camera_step)
             rotations = torch.cat([rotations[:, :1], moved[0]], dim=1)
             translations = torch.cat([translations[:, :1], moved[1]], dim=1)
-        return State(rotations, translations, self.points + point_step)
+        if unknown_step is not None and unknown_step.shape[1]:
+            unknowns = unknown_step if unknowns is None else unknowns + unknown_step
+        return State(rotations, translations, self.points + point_step, unknowns)
 
     def in_cameras(self, columns: Columns = slice(None), dtype: torch.dtype = torch.float64) -> Tensor:
         """The points in every camera's frame, (B, C, 3, N), computed in float64 and then rounded."""
         return se3.moved(self.rotations, self.translations, self.points[..., columns]).to(dtype)
+
+
+def _each(function: Callable[..., Tensor], *states: State) -> State:
+    """A state made of others, tensor by tensor."""
+    tensors = [[getattr(state, field.name) for state in states] for field in fields(State)]
+    return State(*(None if of[0] is None else function(*of) for of in tensors))  # pyright: ignore[reportArgumentType]

@@ -67,7 +67,7 @@ def gauss_newton(
                 descent.propose(*promise)
             moving = [descent.moving for descent in descents]
             steps_m = _largest_movements(step)
-            trial = best.retracted(step.cameras, step.points)
+            trial = best.retracted(step.cameras, step.points, step.unknowns)
             del step
         del system
         if all(descent.stop for descent in descents):

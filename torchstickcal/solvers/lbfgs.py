@@ -33,7 +33,7 @@ class _ScaledUnknowns:
         self._cameras = torch.linalg.cholesky(system.reduced[0]).mT
         self._response = system.response()[0].flatten(1).mT
         self._extrinsics = Extrinsics(start.rotations[0], start.translations[0])
-        self._start = start
+        self._start, self._count = start, start.rotations.shape[1] - 1
         self.camera = start.points.new_zeros(len(self._cameras), 1).requires_grad_()
         self.point = torch.zeros_like(start.points).requires_grad_()
 
@@ -41,14 +41,16 @@ class _ScaledUnknowns:
         """The state, differentiable by the unknowns."""
         points = self._start.points + self._points.back_solve(self.point)
         if not self.camera.numel():
-            return State(self._start.rotations, self._start.translations, points)
-        tangents = torch.linalg.solve_triangular(self._cameras, self.camera, upper=True)
+            return replace(self._start, points=points)
+        step = torch.linalg.solve_triangular(self._cameras, self.camera, upper=True)
+        tangents, unknowns = step.split([6 * self._count, len(step) - 6 * self._count])
         rotations, translations = self._extrinsics.compose(tangents.view(-1, 6))
-        points = points + (self._response @ tangents).view_as(points)
+        points = points + (self._response @ step).view_as(points)
         return State(
             torch.cat([self._start.rotations[:, :1], rotations[None]], dim=1),
             torch.cat([self._start.translations[:, :1], translations[None]], dim=1),
             points,
+            self._start.unknowns if self._start.unknowns is None else self._start.unknowns + unknowns.mT,
         )
 
 
@@ -122,7 +124,7 @@ def _round(objective: Objective, unknowns: _ScaledUnknowns) -> State:
         optimiser.zero_grad()
         state = unknowns.state()
         points = objective.measurements.by_frame(state.points).movedim(1, -1)
-        cost = torch.stack(list(objective.terms(state.rotations, state.translations, points).values())).sum()
+        cost = torch.stack(list(objective.terms(state.rotations, state.translations, points, state.unknowns).values())).sum()
         cost.backward()
         return cost
 

@@ -28,10 +28,14 @@ def polish(objective: Objective, state: State, cameras_free: bool) -> State:
         system = NormalEquations(objective, trial, cameras_free, exact=True)
         lower = system.cost <= cost * (1 + _ROUNDING)
         best, cost = best.replaced(lower, trial), torch.minimum(system.cost, cost)
-        cameras, points, solved = system.solve(system.camera_gradient, system.point_gradient)
-        squared_sigmas = (system.camera_gradient * cameras).sum((1, 2)) + (system.point_gradient * points).sum((1, 2))
+        gradient = system.camera_gradient, system.unknown_gradient, system.point_gradient
+        cameras, unknowns, points, solved = system.solve(*gradient)
+        squared_sigmas = sum(
+            ((by * of).flatten(1).sum(1) for by, of in zip(gradient, (cameras, unknowns, points), strict=True)),
+            torch.zeros_like(cost),
+        )
         moving = lower & solved & (squared_sigmas > _STEP_SIGMAS**2)
         if not bool(moving.any()):
             break
-        trial = best.replaced(moving, best.retracted(-cameras, -points))
+        trial = best.replaced(moving, best.retracted(-cameras, -points, -unknowns))
     return best

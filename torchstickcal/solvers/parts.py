@@ -8,7 +8,8 @@ from typing import Protocol
 import torch
 from torch import Tensor
 
-from torchstickcal.problem import Columns, Measurements
+from torchstickcal.camera_unknowns import Columns
+from torchstickcal.problem import Measurements
 from torchstickcal.solvers.point_elimination import PointElimination
 from torchstickcal.solvers.track_elimination import TrackElimination
 

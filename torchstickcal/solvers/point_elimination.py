@@ -52,27 +52,35 @@ class PointElimination:
         """``H^-1 b`` of a right-hand side (B, 3, n)."""
         return self.back_solve(self.half_solve(rhs))
 
-    def reductions(self, cross: Tensor, points: Tensor, gradient: Tensor, twist: Tensor | None = None) -> tuple[Tensor, Tensor]:
-        """``(L^-1 H_xc)^T`` (B, 6 C', 3 n) and ``L^-1 g`` (B, 3 n).
+    def reductions(
+        self, cross: Tensor, points: Tensor, gradient: Tensor, twist: Tensor | None = None, coupling: Tensor | None = None
+    ) -> tuple[Tensor, Tensor]:
+        """``(L^-1 H_xc)^T`` (B, 6 C' + K, 3 n) and ``L^-1 g`` (B, 3 n).
 
         Args:
             cross: the blocks N_c of C' cameras, (B, C', 6, n).
             points: X, (B, 3, n).
             gradient: g, (B, 3, n).
             twist: the gradients of each camera's part of the cost, (B, C', 3, n), where H_xc is to be exact.
+            coupling: with the cameras' K further unknowns, (B, K, 3, n).
         """
-        rows = _camera_rows(self._lower, cross, points)
+        further = 0 if coupling is None else coupling.shape[1]
+        cameras = 6 * cross.shape[1]
+        rows = cross.new_empty(len(cross), cameras + further, 3, cross.shape[-1])
+        by_camera = rows[:, :cameras].unflatten(1, (-1, 6))
+        _fill_camera_rows(by_camera, self._lower, cross, points)
         if twist is not None:
-            rows[:, :, 3:] += forward(self._lower[:, None, None], twist_rows(twist))
+            by_camera[:, :, 3:] += forward(self._lower[:, None, None], twist_rows(twist))
+        if coupling is not None:
+            rows[:, cameras:] = forward(self._lower[:, None], coupling)
         if self._coupled:
-            rows[..., self._ends] += (self._carry[:, None, None] * rows[..., self._starts].unsqueeze(-2)).sum(-3)
-        return rows.flatten(3).flatten(1, 2), self.half_solve(gradient).flatten(1)
+            rows[..., self._ends] += (self._carry[:, None] * rows[..., self._starts].unsqueeze(-2)).sum(-3)
+        return rows.flatten(2), self.half_solve(gradient).flatten(1)
 
 
-def _camera_rows(lower: Tensor, blocks: Tensor, points: Tensor) -> Tensor:
-    """``(L^-1 N B(X))^T`` as (B, C', 6, 3, n): the forward substitution of N's columns, then the rotations."""
+def _fill_camera_rows(rows: Tensor, lower: Tensor, blocks: Tensor, points: Tensor) -> None:
+    """``(L^-1 N B(X))^T`` into (B, C', 6, 3, n): the forward substitution of N's columns, then the rotations."""
     r0, l10, l20, r1, l21, r2 = lower[:, None, None].unbind(-2)
-    rows = blocks.new_empty(*blocks.shape[:2], 6, 3, blocks.shape[-1])
     x, y, z = rows[:, :, :3].unbind(3)
     torch.mul(blocks[:, :, :3], r0, out=x)
     y[:, :, 0], y[:, :, 1:] = blocks[:, :, 1], blocks[:, :, 3:5]
@@ -80,4 +88,3 @@ def _camera_rows(lower: Tensor, blocks: Tensor, points: Tensor) -> Tensor:
     z[:, :, 0], z[:, :, 1:] = blocks[:, :, 2], blocks[:, :, 4:]
     z.addcmul_(x, l20, value=-1).addcmul_(y, l21, value=-1).mul_(r2)
     add_rotations(rows, points)
-    return rows

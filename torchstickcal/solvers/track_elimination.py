@@ -98,12 +98,16 @@ class TrackElimination:
         steps = (step.transpose(1, 2).flatten(0, 1).repeat_interleave(3, -1) for step in (next_frame, second_frame))
         self._factor = BlockTridiagonal(*_two_frames_a_block(by_track, *steps))
 
-    def reductions(self, cross: Tensor, points: Tensor, gradient: Tensor, twist: Tensor | None = None) -> tuple[Tensor, Tensor]:
+    def reductions(
+        self, cross: Tensor, points: Tensor, gradient: Tensor, twist: Tensor | None = None, coupling: Tensor | None = None
+    ) -> tuple[Tensor, Tensor]:
         """``(L^-1 H_xc)^T`` and ``L^-1 g`` of :class:`PointElimination`, the unknowns in the order of elimination."""
         rows = cross_rows(cross, points)
         if twist is not None:
             rows[:, :, 3:] += twist_rows(twist)
         rows = rows.flatten(1, 2)
+        if coupling is not None:
+            rows = torch.cat([rows, coupling], dim=1)
         levels = self._factor.half_solve(self._blocks(torch.cat([rows, gradient[:, None]], dim=1)))
         solved = torch.cat([level.unflatten(0, (len(rows), -1)).flatten(1, -2) for level in levels], dim=1).mT
         return solved[:, :-1], solved[:, -1]
