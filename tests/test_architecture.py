@@ -16,7 +16,7 @@ LAYERS = [
     ["config", "problem", "extrinsics"],
     ["objective"],
     ["solvers", "noise"],
-    ["gradients", "uncertainty"],
+    ["gradients", "uncertainty", "lens_check"],
     ["initialise", "stages"],
     ["result"],
     ["assemble"],

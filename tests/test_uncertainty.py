@@ -38,7 +38,8 @@ def test_camera_covariance_is_the_block_of_the_whole_inverse(disturbed: tuple[Me
     system = NormalEquations(objective, state, cameras_free=True)
     unit = torch.eye(18, dtype=torch.float64).view(18, 1, 3, 6)
     nothing = torch.zeros_like(state.points)
-    columns = [system.solve(column, nothing)[0].flatten() for column in unit]
+    none = nothing.new_zeros(1, 0)
+    columns = [system.solve(column, none, nothing)[0].flatten() for column in unit]
     torch.testing.assert_close(found, torch.stack(columns), rtol=1e-8, atol=1e-14)
 
 

@@ -213,16 +213,17 @@ class CameraUnknowns:
     prior_sigma: Tensor
 
     @staticmethod
-    def of(names: Sequence[str], cameras: Intrinsics, groups: Sequence[int] | None = None) -> CameraUnknowns:
+    def of(names: Sequence[str], cameras: Intrinsics, groups: Sequence[object] | None = None) -> CameraUnknowns:
         """Those of some of :data:`REFINEMENTS`.
 
         Args:
             names: which.
             cameras: as given, (B, C).
-            groups: (C,), cameras with the same number share what is shared; None if all do.
+            groups: a label for each camera; those with the same share what is shared, None if all do.
         """
         count = cameras.focal_px.shape[-1]
-        members = [[c for c in range(count) if groups is None or groups[c] == g] for g in sorted(set(groups or [0]))]
+        labels = list(groups) if groups else [None] * count
+        members = [[c for c in range(count) if labels[c] == label] for label in dict.fromkeys(labels)]
         kinds: list[Kind] = []
         columns: list[tuple[int, list[int]]] = []
         priors: list[Tensor] = []

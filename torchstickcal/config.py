@@ -24,6 +24,10 @@ _EXTENDS = "extends"
 _UNIONS = (types.UnionType, typing.Union)
 
 
+Refine = Literal["focal", "focal_shared", "principal_point", "radial"]
+"""What may be found of a camera beside its pose, as of :data:`torchstickcal.camera_unknowns.REFINEMENTS`."""
+
+
 @dataclass(frozen=True)
 class InitialiseSettings:
     """How the first estimate is made.
@@ -116,6 +120,8 @@ class Config:
             ``float32`` halves the memory and suits graphics cards that are slow in float64.
         initialise: the first estimate.
         scale: a length between points, where the scale shall not come from the sticks.
+        refine: what else is found of the cameras, in every stage that adjusts them; ``auto`` for what the data contradict.
+        camera_groups: a label for each camera; those with the same share what is shared. Empty: all do.
     """
 
     stages: dict[str, Stage]
@@ -124,6 +130,8 @@ class Config:
     precision: Literal["float64", "float32"] = "float64"
     initialise: InitialiseSettings = field(default_factory=InitialiseSettings)
     scale: ScaleSettings | None = None
+    refine: list[Refine] | Literal["auto"] = field(default_factory=list)
+    camera_groups: list[str] = field(default_factory=list)
 
 
 def config_names() -> list[str]:
@@ -146,6 +154,16 @@ def load_config(config: str | Path | Mapping[str, Any] | Config = "default") -> 
     if not built.stages:
         raise ConfigError("nothing to do", where=f"{where}: stages", got="no stage", expected="at least one")
     return built
+
+
+def with_refine(config: Config, refine: Any) -> Config:
+    """A configuration that refines something else.
+
+    Raises:
+        ConfigError: if that is not a list of :data:`Refine`, or ``auto``.
+    """
+    chosen = _build(typing.get_type_hints(Config)["refine"], refine, "calibrate", ("refine",))
+    return dataclasses.replace(config, refine=chosen)
 
 
 def _read(config: str | Path) -> dict[str, Any]:
@@ -201,7 +219,7 @@ def _build(kind: Any, value: Any, where: str, path: tuple[str, ...]) -> Any:
             return _build(matching[0], value, where, path)
     elif origin is dict and isinstance(value, dict):
         return {key: _build(arguments[1], item, where, (*path, key)) for key, item in value.items()}
-    elif origin is list and isinstance(value, list):
+    elif origin is list and isinstance(value, list | tuple):
         return [_build(arguments[0], item, where, (*path, str(number))) for number, item in enumerate(value)]
     elif _fits(kind, value):
         return float(value) if kind is float else value
@@ -234,6 +252,8 @@ def _build_dataclass(kind: type, value: Any, where: str, path: tuple[str, ...]) 
 def _fits(kind: Any, value: Any) -> bool:
     if typing.get_origin(kind) is Literal:
         return isinstance(value, str) and value in typing.get_args(kind)
+    if typing.get_origin(kind) is list:
+        return isinstance(value, list | tuple)
     if dataclasses.is_dataclass(kind):
         return isinstance(value, dict)
     if kind is float:
@@ -246,6 +266,8 @@ def _fits(kind: Any, value: Any) -> bool:
 def _description(kind: Any) -> str:
     if typing.get_origin(kind) is Literal:
         return " or ".join(repr(option) for option in typing.get_args(kind))
+    if typing.get_origin(kind) is list:
+        return f"a list of {_description(typing.get_args(kind)[0])}"
     if typing.get_origin(kind) in _UNIONS:
         return " or ".join("false" if option is type(None) else _description(option) for option in typing.get_args(kind))
     if dataclasses.is_dataclass(kind):

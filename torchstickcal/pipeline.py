@@ -3,18 +3,22 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, Literal, Protocol
 
 import torch
 from torch import Tensor
 
 from torchstickcal.assemble import assemble
-from torchstickcal.config import Config, StickLengthSettings, load_config
+from torchstickcal.camera_unknowns import CameraUnknowns
+from torchstickcal.config import Config, Refine, Stage, StickLengthSettings, load_config, with_refine
+from torchstickcal.errors import ConfigError
 from torchstickcal.initialise import initialise
+from torchstickcal.lens_check import LensCheck, with_refinements
 from torchstickcal.observations import Observations
-from torchstickcal.problem import Measurements
+from torchstickcal.problem import Measurements, State
 from torchstickcal.result import Calibration
 from torchstickcal.solvers import IterationRecord
 from torchstickcal.stages import StageRecord, StageResult, rulers, run_stage
@@ -38,6 +42,7 @@ def calibrate(
     observations: Observations,
     config: str | Path | Mapping[str, Any] | Config = "default",
     callback: Callback | None = None,
+    refine: Sequence[Refine] | Literal["auto"] | None = None,
 ) -> Calibration:
     """Find the extrinsics of all cameras and the 3D points, in metres, in the frame of the first camera.
 
@@ -45,6 +50,8 @@ def calibrate(
         observations: keypoints, intrinsics and sticks.
         config: a configuration's name, a TOML file, a mapping of its keys, or a :class:`Config`.
         callback: listens to the iterations and the result.
+        refine: what else to find of the cameras, instead of what the configuration says: some of ``focal``, ``focal_shared``,
+            ``principal_point``, ``radial``, or ``auto`` for what the data contradict.
 
     Returns:
         The calibration. Its ``status`` says whether every stage converged; a stage that did not leaves the best state it
@@ -55,6 +62,8 @@ def calibrate(
         RigError: if the cameras cannot be placed in one rig.
     """
     settings = load_config(config)
+    if refine is not None:
+        settings = with_refine(settings, refine)
     return on_worker(observations.keypoints.device, _calibrated, observations, settings, callback)
 
 
@@ -74,34 +83,83 @@ def _calibrated(observations: Observations, settings: Config, callback: Callback
     precision = torch.float32 if settings.precision == "float32" else torch.float64
     measurements = Measurements.of(observations, points_used(observations, settings), precision)
     labels = [observations.camera_label(index) for index in range(observations.num_cameras)]
+    refined = () if settings.refine == "auto" else tuple(settings.refine)
+    measurements = refining(measurements, refined, settings)
 
     state = initialise(measurements, settings.initialise, labels)
     seconds = {"initialise": time.perf_counter() - began}
 
-    reached = adjusted = None
     records: list[StageRecord] = []
     listener = callback.on_iteration if callback else _ignore
-    for name, stage in settings.stages.items():
-        reached = run_stage(name, stage, measurements, state, known, settings.solver, listener)
-        state = reached.state
-        adjusted = reached if stage.cameras == "free" else adjusted
-        records += reached.records
-        seconds[name] = records[-1].seconds
-    assert reached is not None
-    covariance = adjusted and _covariance(measurements, adjusted, reached.sigma_px)
+
+    def run(stages: Mapping[str, Stage], start: State) -> StageResult:
+        result: StageResult | None = None
+        for name, stage in stages.items():
+            result = run_stage(name, stage, measurements, start, known, settings.solver, listener)
+            start = result.state
+            records.extend(result.records)
+            seconds[name] = seconds.get(name, 0.0) + records[-1].seconds
+        assert result is not None
+        return result
+
+    adjusting, holding = _split(settings.stages)
+    adjusted = reached = run(adjusting, state)
+    check = _check(measurements, adjusted, settings)
+    while settings.refine == "auto" and (wanted := with_refinements(refined, check.wanted(refined))) != refined:
+        refined = wanted
+        measurements = refining(measurements, refined, settings)
+        adjusted = reached = run(adjusting, replace(adjusted.state, unknowns=None))
+        check = _check(measurements, adjusted, settings)
+    if holding:
+        reached = run(holding, adjusted.state)
+    covariance = _covariance(measurements, adjusted, reached.sigma_px)
     seconds["total"] = time.perf_counter() - began
 
-    calibration = assemble(observations, measurements, reached, covariance, records, seconds)
+    calibration = assemble(observations, measurements, reached, covariance, refined, check.focal(), records, seconds)
     if callback:
         callback.on_end(calibration)
     return calibration
 
 
-def _covariance(measurements: Measurements, adjusted: StageResult, sigma_px: Tensor) -> Tensor:
-    """The cameras' covariance where they were adjusted, for the noise found since."""
+def refining(measurements: Measurements, names: Sequence[str], settings: Config) -> Measurements:
+    """Measurements with some of :data:`torchstickcal.camera_unknowns.REFINEMENTS` among the unknowns.
+
+    Raises:
+        ConfigError: if there are camera groups, but not a label for each camera.
+    """
+    groups = settings.camera_groups
+    if groups and len(groups) != measurements.num_cameras:
+        raise ConfigError(
+            "camera groups do not fit the cameras",
+            where="camera_groups",
+            got=f"{len(groups)} labels",
+            expected=f"{measurements.num_cameras}, one for each camera",
+        )
+    return replace(measurements, unknowns=CameraUnknowns.of(names, measurements.cameras, groups) if names else None)
+
+
+def _split(stages: Mapping[str, Stage]) -> tuple[dict[str, Stage], dict[str, Stage]]:
+    """The stages up to the last that adjusts the cameras, and those after it."""
+    names = list(stages)
+    last = max((number for number, name in enumerate(names) if stages[name].cameras == "free"), default=len(names) - 1)
+    return {name: stages[name] for name in names[: last + 1]}, {name: stages[name] for name in names[last + 1 :]}
+
+
+def _check(measurements: Measurements, adjusted: StageResult, settings: Config) -> LensCheck:
+    kept = measurements.keeping(adjusted.inliers)
+    return LensCheck(kept, adjusted.state, adjusted.sigma_px, _sigma_length_m(adjusted), settings.camera_groups)
+
+
+def _covariance(measurements: Measurements, adjusted: StageResult, sigma_px: Tensor) -> Tensor | None:
+    """That of the cameras where they were adjusted, for the noise found since."""
+    if not adjusted.cameras_free:
+        return None
+    return camera_covariance(measurements.keeping(adjusted.inliers), adjusted.state, sigma_px, _sigma_length_m(adjusted))
+
+
+def _sigma_length_m(adjusted: StageResult) -> Tensor | float:
     length = adjusted.losses.get("stick_length")
-    sigma_m = length.sigma if length is not None and length.weight == 1.0 else StickLengthSettings().sigma_m
-    return camera_covariance(measurements.keeping(adjusted.inliers), adjusted.state, sigma_px, sigma_m)
+    return length.sigma if length is not None and length.weight == 1.0 else StickLengthSettings().sigma_m
 
 
 def _ignore(record: IterationRecord) -> None:

@@ -22,7 +22,7 @@ from torchstickcal.solvers import IterationRecord, Stop
 from torchstickcal.stages import StageRecord
 from torchstickcal.uncertainty import centre_covariances, point_covariances, relative_scale_std
 
-_FORMAT = "torchstickcal calibration 2"
+_FORMAT = "torchstickcal calibration 3"
 _TENSORS = (
     "rotations",
     "translations",
@@ -33,8 +33,14 @@ _TENSORS = (
     "stick_lengths_m",
     "sigma_px",
     "intrinsics",
+    "lens_std",
+    "focal_ratio",
+    "focal_ratio_std",
 )
 _OPTIONAL_TENSORS = ("distortion", "image_size")
+
+LENS_PARAMETERS = ("focal", "centre_x", "centre_y", "k1", "k2")
+"""What may be found of a lens, in the order of :attr:`Calibration.lens_std`."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,9 +68,18 @@ class Calibration:
     sigma_px: Tensor
     """(P,), estimated noise of each point's keypoints along an axis, pixels"""
     intrinsics: Tensor
-    """(C, 3, 3)"""
+    """(C, 3, 3), as given or, where ``refined`` says so, as found"""
     distortion: Tensor | None
-    """(C, D), OpenCV's order"""
+    """(C, D), OpenCV's order, likewise"""
+    refined: tuple[str, ...]
+    """what was found of the cameras beside their poses, of :data:`torchstickcal.camera_unknowns.REFINEMENTS`"""
+    lens_std: Tensor
+    """(C, 5), standard deviations of :data:`LENS_PARAMETERS` as found: focal length as a share of it, principal point in
+    pixels, k1 and k2; zero where taken as given"""
+    focal_ratio: Tensor
+    """(C,), the focal length that the data have over the one given: as found, else as far as one linearisation tells"""
+    focal_ratio_std: Tensor
+    """(C,), its standard deviation"""
     image_size: Tensor | None
     """(C, 2), width and height, pixels"""
     fisheye: bool
@@ -173,6 +188,7 @@ class Calibration:
         meta = {
             "format": _FORMAT,
             "fisheye": self.fisheye,
+            "refined": self.refined,
             "sticks": [dataclasses.astuple(stick) for stick in self.sticks],
             "fps": self.fps,
             "point_names": self.point_names,
@@ -202,6 +218,7 @@ class Calibration:
                 distortion=arrays.get("distortion"),
                 image_size=arrays.get("image_size"),
                 fisheye=meta["fisheye"],
+                refined=tuple(meta["refined"]),
                 sticks=tuple(Stick(*stick) for stick in meta["sticks"]),
                 fps=meta["fps"],
                 point_names=None if meta["point_names"] is None else tuple(meta["point_names"]),

@@ -128,6 +128,8 @@ class StageResult(NamedTuple):
     """(B, C, N)"""
     sigma_px: Tensor
     """(B, P)"""
+    cameras_free: bool
+    """whether the stage adjusted the cameras"""
     records: tuple[StageRecord, ...]
     """one for each session"""
 
@@ -165,7 +167,7 @@ def run_stage(
     seconds = time.perf_counter() - began
     ended = zip(outcome.stops, outcome.iterations, strict=True)
     records = tuple(StageRecord(name, stop, seconds, iterations) for stop, iterations in ended)
-    return StageResult(state, minimum, objective.losses, measurements.visible, sigma_px, records)
+    return StageResult(state, minimum, objective.losses, measurements.visible, sigma_px, stage.cameras == "free", records)
 
 
 def _losses(stage: Stage, measurements: Measurements, state: State, sigma_px: Tensor) -> dict[str, Loss]:

@@ -23,10 +23,10 @@ _OPEN = 1e-12
 
 
 def camera_covariance(measurements: Measurements, state: State, sigma_px: Tensor, sigma_length_m: Tensor | float) -> Tensor:
-    """Covariance of the tangents of all cameras but the first, (B, 6 (C - 1), 6 (C - 1)), metres and radians.
+    """Covariance of the tangents of all cameras but the first, metres and radians, and then of the cameras' K further unknowns.
 
-    Of keypoints with normal noise, and of the sticks' lengths as far as they hold; a length given wrong is not in it. A
-    direction that nothing determines, as the scale is without a stick, is left out.
+    (B, 6 (C - 1) + K, 6 (C - 1) + K), of keypoints with normal noise, and of the sticks' lengths as far as they hold; a length
+    given wrong is not in it. A direction that nothing determines, as the scale is without a stick, is left out.
 
     Args:
         measurements: those that took part.

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import torch
 
 from torchstickcal import se3
 from torchstickcal.benchmark.cases import Case
+from torchstickcal.camera_unknowns import CameraUnknowns
 from torchstickcal.losses import ReprojectionLoss, StickLengthLoss
 from torchstickcal.metrics import pose_errors
 from torchstickcal.objective import Objective
@@ -26,8 +28,8 @@ class Bound:
     translation_m: float
 
 
-def camera_bound(case: Case, draws: int = 2000, seed: int = 0) -> Bound | None:
-    """The bound of a case for those who know its inliers, their noise and its lenses, and the stick's length exactly.
+def camera_bound(case: Case, draws: int = 2000, seed: int = 0, unknown: Sequence[str] = ()) -> Bound | None:
+    """The bound of a case for those who know its inliers, their noise and the stick's length exactly, and its lenses.
 
     The inverse of the reduced camera system at the truth is the least covariance of the cameras. Errors drawn from it go
     through the same alignment and the same mean as those of an estimate.
@@ -36,6 +38,7 @@ def camera_bound(case: Case, draws: int = 2000, seed: int = 0) -> Bound | None:
         case: a session with true points.
         draws: errors drawn; their mean scatters by some 50 % / sqrt(draws).
         seed: of the draws.
+        unknown: what of the lenses they do not know, as of :data:`torchstickcal.camera_unknowns.REFINEMENTS`.
 
     Returns:
         The bound; None where truth, noise or inliers are not known, or the inliers do not determine the cameras.
@@ -49,6 +52,10 @@ def camera_bound(case: Case, draws: int = 2000, seed: int = 0) -> Bound | None:
     measurements = Measurements.of(observations).keeping(torch.from_numpy(case.inliers).flatten(1)[None])
     sigma_px = torch.from_numpy(case.sigma_px).flatten(1).clamp_min(1e-6)
     measurements = replace(measurements, confidence=measurements.visible / sigma_px.square())
+    if unknown:
+        unknowns = CameraUnknowns.of(unknown, measurements.cameras)
+        unknowns = replace(unknowns, prior_sigma=torch.full_like(unknowns.prior_sigma, torch.inf))
+        measurements = replace(measurements, unknowns=unknowns)
     objective = Objective(measurements, {"reprojection": ReprojectionLoss(), "stick_length": StickLengthLoss(_SIGMA_LENGTH_M)})
     points = truth.points.flatten(0, 1).mT.contiguous()
     state = State(truth.rotations[None], truth.translations[None], points[None])
@@ -56,7 +63,8 @@ def camera_bound(case: Case, draws: int = 2000, seed: int = 0) -> Bound | None:
     if int(failed):
         return None
     normal = torch.randn(len(factor), draws, generator=torch.Generator().manual_seed(seed), dtype=factor.dtype)
-    tangents = torch.linalg.solve_triangular(factor.mT, normal, upper=True).mT.unflatten(1, (-1, 6))
+    drawn = torch.linalg.solve_triangular(factor.mT, normal, upper=True).mT
+    tangents = drawn[:, : 6 * (len(truth.rotations) - 1)].unflatten(1, (-1, 6))
     tangents = torch.nn.functional.pad(tangents, (0, 0, 1, 0))
     drawn = se3.retract(truth.rotations.expand(draws, -1, 3, 3), truth.translations.expand(draws, -1, 3), tangents)
     errors = pose_errors(*drawn, truth.rotations, truth.translations)
