@@ -18,7 +18,7 @@ LAYERS = [
     ["solvers", "noise"],
     ["gradients", "uncertainty", "lens_check"],
     ["initialise", "stages"],
-    ["result"],
+    ["focal_search", "result"],
     ["assemble"],
     ["pipeline", "metrics", "report", "figures"],
     ["layer"],

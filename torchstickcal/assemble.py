@@ -122,7 +122,7 @@ def _lens_warnings(
     """What was given and is contradicted, and what was to be found and could not be."""
     found: list[str] = []
     for camera, (value, sigma) in enumerate(zip(ratio.tolist(), std.tolist(), strict=True)):
-        if abs(value - 1) > max(_CONTRADICTED_SIGMAS * sigma, _CONTRADICTED_SHARE):
+        if observations.intrinsics_known and abs(value - 1) > max(_CONTRADICTED_SIGMAS * sigma, _CONTRADICTED_SHARE):
             used = "was found" if lenses[camera, 0] > 0 else "is what the data want, the given one was used"
             found.append(f"{observations.camera_label(camera)}: {value:.4f} +- {sigma:.4f} of the given focal length {used}.")
     unknowns = measurements.unknowns

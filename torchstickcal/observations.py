@@ -57,7 +57,8 @@ class Observations:
 
     Args:
         keypoints: pixels (C, F, P, 2) as detected (distorted), NaN where a point was not seen.
-        intrinsics: camera matrices, (C, 3, 3) or one (3, 3) shared by all.
+        intrinsics: camera matrices, (C, 3, 3) or one (3, 3) shared by all; None if they are to be found, for which the image
+            size is needed. The principal point is then taken to be the image's centre.
         sticks: one stick or several with disjoint ends; empty if the scale comes from elsewhere.
         distortion: (C, D) or (D,), OpenCV's order, D of 4, 5 or 8; None for perfect lenses.
         confidence: (C, F, P) in [0, 1], the weight of a keypoint: its variance is divided by it. 0 is not seen.
@@ -83,6 +84,8 @@ class Observations:
     point_names: tuple[str, ...] | None = None
     camera_names: tuple[str, ...] | None = None
     fisheye: bool = False
+    intrinsics_known: bool = True
+    """False where ``intrinsics`` is a guess from the image size"""
     visible: Tensor = field(init=False, repr=False, compare=False)
     """(C, F, P), True where a keypoint is given with a confidence above 0."""
 
@@ -98,11 +101,13 @@ class Observations:
         point_names: Sequence[str] | None = None,
         camera_names: Sequence[str] | None = None,
         fisheye: bool = False,
+        intrinsics_known: bool = True,
     ) -> None:
         put = object.__setattr__
         put(self, "keypoints", _tensor(keypoints, "keypoints"))
         device = self.keypoints.device
-        put(self, "intrinsics", _tensor(intrinsics, "intrinsics", device))
+        put(self, "intrinsics_known", intrinsics_known and intrinsics is not None)
+        put(self, "intrinsics", _tensor(_guess(image_size) if intrinsics is None else intrinsics, "intrinsics", device))
         put(self, "sticks", (sticks,) if isinstance(sticks, Stick) else tuple(sticks))
         for name, value in (("distortion", distortion), ("confidence", confidence), ("image_size", image_size)):
             put(self, name, None if value is None else _tensor(value, name, device))
@@ -307,6 +312,23 @@ def _tensor(value: Any, name: str, device: torch.device | None = None) -> Tensor
     if tensor.is_complex() or tensor.dtype == torch.bool:
         raise ObservationError("not an array of real numbers", where=name, got=tensor.dtype, expected="real numbers")
     return tensor.to(device=device, dtype=tensor.dtype if tensor.is_floating_point() else torch.float64)
+
+
+def _guess(image_size: Any) -> Tensor:
+    """Camera matrices (..., 3, 3) of images (..., 2): the centre, and a focal length as long as the wider side.
+
+    Raises:
+        ObservationError: if there is no image size.
+    """
+    if image_size is None:
+        raise ObservationError(
+            "neither intrinsics nor image size", where="intrinsics", got="None", expected="camera matrices, or image_size"
+        )
+    size = _tensor(image_size, "image_size")
+    matrix = torch.eye(3, dtype=torch.float64).repeat(*size.shape[:-1], 1, 1)
+    matrix[..., :2, 2] = (size - 1) / 2
+    matrix[..., [0, 1], [0, 1]] = size.amax(-1, keepdim=True).to(matrix)
+    return matrix
 
 
 def _refuse_first(what: str, bad: Tensor, values: Tensor, expected: str, where: str = "keypoints") -> None:

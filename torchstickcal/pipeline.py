@@ -15,6 +15,7 @@ from torchstickcal.assemble import assemble
 from torchstickcal.camera_unknowns import CameraUnknowns
 from torchstickcal.config import Config, Refine, Stage, StickLengthSettings, load_config, with_refine
 from torchstickcal.errors import ConfigError
+from torchstickcal.focal_search import search_focal
 from torchstickcal.initialise import initialise
 from torchstickcal.lens_check import LensCheck, with_refinements
 from torchstickcal.observations import Observations
@@ -84,9 +85,12 @@ def _calibrated(observations: Observations, settings: Config, callback: Callback
     measurements = Measurements.of(observations, points_used(observations, settings), precision)
     labels = [observations.camera_label(index) for index in range(observations.num_cameras)]
     refined = () if settings.refine == "auto" else tuple(settings.refine)
+    if observations.intrinsics_known:
+        state = initialise(measurements, settings.initialise, labels)
+    else:
+        measurements, state = search_focal(measurements, settings, labels, known)
+        refined = refined if "focal" in refined else with_refinements(refined, ("focal_shared",))
     measurements = refining(measurements, refined, settings)
-
-    state = initialise(measurements, settings.initialise, labels)
     seconds = {"initialise": time.perf_counter() - began}
 
     records: list[StageRecord] = []
