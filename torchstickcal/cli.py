@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 from torchstickcal.errors import CalibrationError
 
 if TYPE_CHECKING:
+    from torchstickcal.config import Config
     from torchstickcal.io import Truth
     from torchstickcal.metrics import PoseErrors
     from torchstickcal.pipeline import Callback
@@ -43,6 +44,12 @@ def _parser() -> argparse.ArgumentParser:
     command.add_argument("session", metavar="SESSION", type=Path, help="an .npz session or a Sports-Stick-Syn .pkl")
     command.add_argument("--out", metavar="DIR", type=Path, required=True, help="folder for the results, made if need be")
     _add_config(command)
+    command.add_argument(
+        "--refine",
+        metavar="A,B|auto|none",
+        help="what to find of the lenses: focal, focal_shared, principal_point, radial, none, or auto for what the data "
+        "contradict (default: as configured, else auto)",
+    )
     command.add_argument("--stick-length", metavar="M", type=float, help="length of the stick in metres, if not the session's")
     command.add_argument("--tensorboard", metavar="DIR", type=Path, help="write a TensorBoard log of the calibration")
     command.set_defaults(run=_calibrate)
@@ -113,9 +120,16 @@ def _calibrate(options: argparse.Namespace) -> int:
     observations, _ = read_session(options.session)
     if options.stick_length is not None:
         observations = observations.with_stick_length(options.stick_length)
-    calibration = calibrate(observations, config, _Progress(_monitor(options.tensorboard)))
+    calibration = calibrate(observations, config, _Progress(_monitor(options.tensorboard)), _refine(options.refine, config))
     _write(calibration, options.out, {"session": str(options.session), "config": options.config})
     return _show(calibration, options.out)
+
+
+def _refine(option: str | None, config: Config) -> Any:
+    """What to refine: as the option says, else the configuration, else ``auto``."""
+    if option in {None, "auto"}:
+        return config.refine or "auto" if option is None else "auto"
+    return [] if option == "none" else str(option).split(",")
 
 
 def _evaluate(options: argparse.Namespace) -> int:

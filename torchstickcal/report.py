@@ -6,7 +6,7 @@ from typing import Any
 
 import torch
 
-from torchstickcal.result import Calibration
+from torchstickcal.result import LENS_PARAMETERS, Calibration
 
 
 def table(calibration: Calibration) -> str:
@@ -26,6 +26,12 @@ def table(calibration: Calibration) -> str:
         for name, centre, std_m, std_deg, px, used in cameras
     ]
     text = [_aligned(rows), ""]
+    rows = [["lens", "focal (px)", "data / given", "found"]]
+    for index, name in enumerate(calibration.camera_names):
+        focal = float(calibration.intrinsics[index, [0, 1], [0, 1]].mean())
+        ratio, std = float(calibration.focal_ratio[index]), float(calibration.focal_ratio_std[index])
+        rows.append([name, f"{focal:.2f}", f"{ratio:.4f} +- {std:.4f}", ", ".join(calibration.refined) or "-"])
+    text += [_aligned(rows), ""]
     if calibration.sticks:
         rows = [["stick", "given (m)", "mean (m)", "spread (mm)", "frames"]]
         for stick, lengths in zip(calibration.sticks, calibration.stick_lengths_m.mT, strict=True):
@@ -71,6 +77,25 @@ def summary(calibration: Calibration) -> dict[str, Any]:
                 calibration.camera_std_deg.tolist(),
                 calibration.reprojection_median_px.tolist(),
                 _keypoints_used(calibration),
+                strict=True,
+            )
+        ],
+        "refined": list(calibration.refined),
+        "lenses": [
+            {
+                "name": name,
+                "focal_px": [matrix[0][0], matrix[1][1]],
+                "principal_point_px": [matrix[0][2], matrix[1][2]],
+                "focal_data_over_given": ratio,
+                "focal_data_over_given_std": ratio_std,
+                "std": dict(zip(LENS_PARAMETERS, lens_std, strict=True)),
+            }
+            for name, matrix, ratio, ratio_std, lens_std in zip(
+                calibration.camera_names,
+                calibration.intrinsics.tolist(),
+                calibration.focal_ratio.tolist(),
+                calibration.focal_ratio_std.tolist(),
+                calibration.lens_std.tolist(),
                 strict=True,
             )
         ],
