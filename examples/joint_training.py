@@ -23,7 +23,7 @@ On sessions held out (two cores, two minutes):
     rotations (deg)      3.67     1.04
 
 What is left is what the views agree on: the part of the wrong labels that another pose of the camera or another place of the
-point explains, and the stick's ends, found half a pixel too far in, make the scene 3 % too large.
+point explains, and errors of the stick's ends, which set the scale, common to all views.
 """
 
 from __future__ import annotations
