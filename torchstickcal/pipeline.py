@@ -107,15 +107,19 @@ def _calibrated(observations: Observations, settings: Config, callback: Callback
         return result
 
     adjusting, holding = _split(settings.stages)
-    adjusted = reached = run(adjusting, state)
+    adjusted = run(adjusting, state)
     check = _check(measurements, adjusted, settings)
     while settings.refine == "auto" and (wanted := with_refinements(refined, check.wanted(refined))) != refined:
-        refined = wanted
-        measurements = refining(measurements, refined, settings)
-        adjusted = reached = run(adjusting, replace(adjusted.state, unknowns=None))
+        before = len(records)
+        known_lenses, measurements = measurements, refining(measurements, wanted, settings)
+        found = run(adjusting, replace(adjusted.state, unknowns=None))
+        if not all(record.stop.converged for record in records[before:]):
+            measurements = known_lenses
+            del records[before:]
+            break
+        refined, adjusted = wanted, found
         check = _check(measurements, adjusted, settings)
-    if holding:
-        reached = run(holding, adjusted.state)
+    reached = run(holding, adjusted.state) if holding else adjusted
     covariance = _covariance(measurements, adjusted, reached.sigma_px)
     seconds["total"] = time.perf_counter() - began
 
