@@ -76,14 +76,18 @@ class LensCheck:
         values, covariance = self._solved(("focal",))
         return FocalCheck(values.exp(), covariance.diagonal().sqrt())
 
-    def wanted(self, refined: Sequence[str] = ()) -> tuple[str, ...]:
+    def wanted(self, refined: Sequence[str] = (), failed: Sequence[tuple[str, ...]] = ()) -> tuple[str, ...]:
         """The refinements that the data call for beside those made; none where the lenses in use agree with the data.
 
         Each choice is judged by the decrease of the cost it promises, less a price for each of its parameters.
+
+        Args:
+            refined: the refinements made.
+            failed: choices that have been tried in vain.
         """
         best, choice = _SIGMAS**2, ()
         for names in _CHOICES:
-            if set(names) <= set(refined):
+            if names in failed or with_refinements(refined, names) == tuple(refined):
                 continue
             gain = self._decrease(names) - self._decrease(()) - _PRICE * CameraUnknowns.of(names, self._cameras).count
             if gain > best:

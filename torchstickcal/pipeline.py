@@ -109,14 +109,17 @@ def _calibrated(observations: Observations, settings: Config, callback: Callback
     adjusting, holding = _split(settings.stages)
     adjusted = run(adjusting, state)
     check = _check(measurements, adjusted, settings)
-    while settings.refine == "auto" and (wanted := with_refinements(refined, check.wanted(refined))) != refined:
+    failed: list[tuple[str, ...]] = []
+    while settings.refine == "auto" and (choice := check.wanted(refined, failed)):
+        wanted = with_refinements(refined, choice)
         before = len(records)
         known_lenses, measurements = measurements, refining(measurements, wanted, settings)
         found = run(adjusting, replace(adjusted.state, unknowns=None))
         if not all(record.stop.converged for record in records[before:]):
             measurements = known_lenses
+            failed.append(choice)
             del records[before:]
-            break
+            continue
         refined, adjusted = wanted, found
         check = _check(measurements, adjusted, settings)
     reached = run(holding, adjusted.state) if holding else adjusted
