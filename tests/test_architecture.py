@@ -17,7 +17,7 @@ LAYERS = [
     ["objective"],
     ["solvers", "noise"],
     ["gradients", "uncertainty"],
-    ["initialise", "stages"],
+    ["initialise", "synchronise", "stages"],
     ["result"],
     ["assemble"],
     ["pipeline", "metrics", "report", "figures"],
