@@ -27,7 +27,7 @@ _MAX_FRAMES = 2000
 _CUT = 3.0
 _NEAR_FRAMES, _AROUND_FRAMES = 2, 5
 _LEAST_GAIN = 0.5
-_RIVAL_SHARE = 0.85
+_RIVAL_SHARE = 0.75
 _PEAK_SHARE, _WIDEST_PEAK_FRAMES = 0.95, 4
 _PAIR_SCALE_FRAMES = 0.5
 _STIFFNESS = 1e-9
@@ -106,24 +106,24 @@ def _joint_offsets(tracks: Tracks, reach: int, noise_px: float) -> tuple[Pairs, 
     """Agreement of all pairs, what each gains at every lag (C, C, L), and the whole offsets (C,) at which all gain most.
 
     A pair's gain is the logarithm of how little of the motion epipolar lines leave unexplained, over that at the median lag,
-    times the number of common points: a log-likelihood, that of a stranger being 0.
+    times the square root of the number of common points: as sure as it is large against its scatter at wrong lags.
     """
     cameras = len(tracks.weights)
     pairs = {pair: tracks.agreement(*pair) for pair in combinations(range(cameras), 2)}
     gains = torch.zeros(cameras, cameras, len(tracks.lags), dtype=torch.float64)
     for (i, j), pair in pairs.items():
-        unexplained = ((pair.residual_px2 + noise_px**2) / (pair.motion_px2 + noise_px**2)).log()
-        gains[i, j] = (pair.points * (unexplained.nanmedian() - unexplained)).nan_to_num(nan=0.0)
+        unexplained = ((pair.residual_px2 + (noise_px / 4) ** 2) / (pair.motion_px2 + noise_px**2)).log()
+        gains[i, j] = (pair.points.sqrt() * (unexplained.nanmedian() - unexplained)).nan_to_num(nan=0.0)
         gains[j, i] = gains[i, j].flip(0)
     return pairs, gains, _joined(gains, reach)
 
 
 def _common_points(pairs: Pairs, cameras: int) -> Tensor:
-    """Number of points two cameras have in common at every lag, (C, C, L)."""
+    """Square root of the number of points two cameras have in common at every lag, (C, C, L)."""
     first = next(iter(pairs.values())).points
     counts = first.new_zeros(cameras, cameras, len(first))
     for (i, j), pair in pairs.items():
-        counts[i, j], counts[j, i] = pair.points, pair.points.flip(0)
+        counts[i, j], counts[j, i] = pair.points.sqrt(), pair.points.flip(0).sqrt()
     return counts
 
 
@@ -178,25 +178,20 @@ def _in_agreement(tracks: Tracks, offsets: Tensor, noise_px: float) -> Tensor:
 
 
 def _doubts(pairs: Pairs, gains: Tensor, offsets: Tensor, reach: int) -> tuple[str, ...]:
-    """Why a camera's offset is not determined, each; empty where it is.
-
-    An offset further off has fewer points in common, so that a repeated motion gains less there: a rival is judged half by
-    its gain, half by its gain per point.
-    """
+    """Why a camera's offset is not determined, each; empty where it is."""
     everyone, counts = range(len(offsets)), _common_points(pairs, len(offsets))
     doubts = []
     for camera in everyone:
         support, points = (_support(values, offsets, camera, everyone, reach) for values in (gains, counts))
         best = int(offsets[camera]) + reach
         away = (torch.arange(len(support)) - best).abs()
-        likeness = support / support[best] * (points[best] / points.clamp_min(1.0)).sqrt()
-        rivals = likeness[away > max(_WIDEST_PEAK_FRAMES, reach // 10)]
+        rivals = support[away > max(_WIDEST_PEAK_FRAMES, reach // 10)]
         width = int(away[support >= _PEAK_SHARE * support[best]].max())
         if points[best] == 0:
             doubts.append("too few points in common with other cameras")
         elif support[best] < _LEAST_GAIN * points[best]:
             doubts.append("too little motion to tell one offset from another")
-        elif bool((rivals > _RIVAL_SHARE).any()):
+        elif bool((rivals > _RIVAL_SHARE * support[best]).any()):
             doubts.append("the motion fits another offset nearly as well")
         elif width > _WIDEST_PEAK_FRAMES:
             doubts.append(f"the motion is too slow: it fits any offset within {width} frames")
