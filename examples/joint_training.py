@@ -6,9 +6,9 @@
 
 A venue with six cameras, in whose pictures athletes swing clubs, bats, sticks and shinais. A detector is first trained on
 labels that are wrong in two views of every point, and learns the error too. Then it goes on without labels. Its keypoints and
-its confidence go through :class:`torchstickcal.CalibrationLayer`. The loss is how far the layer's points are from the rays of the
-keypoints through the layer's cameras, and how far the stick is from its length; nothing else supervises, and the gradient goes
-through the cameras that the keypoints themselves have determined.
+its confidence go through :class:`torchstickcal.CalibrationLayer`. The loss is how far the layer's points are from the rays of
+the keypoints through the layer's cameras, and how far the stick is from its length. Nothing else supervises, and the gradient
+goes through the cameras that the keypoints themselves have determined.
 
 The distances are metres, not pixels: in pixels the views agree the better the smaller the detector makes the athlete. The loss
 is linear in large distances, so that the views in the majority decide, and the steps are those of plain gradient descent: a

@@ -17,7 +17,7 @@ LAYERS = [
     ["objective"],
     ["solvers", "noise"],
     ["gradients", "uncertainty", "lens_check"],
-    ["initialise", "stages"],
+    ["initialise", "synchronise", "stages"],
     ["focal_search", "result"],
     ["assemble"],
     ["pipeline", "metrics", "report", "figures"],

@@ -1,0 +1,118 @@
+"""Clock offsets from the motion, and sessions moved onto a common frame axis."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from torchstickcal import ObservationError, Observations, Stick
+from torchstickcal.problem import Measurements
+from torchstickcal.simulate import Clocks, Noise, SessionSpec
+from torchstickcal.simulate.regimes import DroppedFrames, FrameRates, Gaps, SelfOcclusion
+from torchstickcal.simulate.session import Assumptions
+from torchstickcal.synchronise import search_offsets, shifted
+from torchstickcal.synchronise.epipolar import Tracks
+
+HARD = (Noise(1.5, missing=0.1, outliers=0.05), SelfOcclusion())
+SPEC = SessionSpec("clocks", "golf", 7, 4, 150, 30.0, "ring", regimes=HARD, clocks=Clocks(1.0))
+
+
+@pytest.mark.parametrize(
+    "spec",
+    [
+        SPEC,
+        replace(SPEC, sport="hockey", cameras=3, clocks=Clocks(2.0)),
+        replace(SPEC, sport="kendo", frames=300, fps=60.0, clocks=Clocks(1.0, readout_s=0.015)),
+        replace(SPEC, sport="wand", cameras=3, assumptions=Assumptions(focal_scale=1.1)),
+        replace(SPEC, sport="baseball", regimes=(*HARD, DroppedFrames(0.1), Gaps(0.15))),
+        replace(SPEC, regimes=(*HARD, FrameRates((1.0, 1.0, 0.5)))),
+    ],
+    ids=["golf", "far", "rolling", "focal", "gaps", "rates"],
+)
+def test_offsets_come_back_to_a_fraction_of_a_frame(spec: SessionSpec):
+    session = spec.generate()
+    truth = session.truth.time_offsets_s * spec.fps
+    found = search_offsets(Measurements.of(session.observations), spec.clocks.offset_s * spec.fps)
+    assert found.offsets_frames.dtype == torch.float64
+    assert found.offsets_frames[0] == 0
+    assert all(found.determined), found.reasons
+    assert (found.offsets_frames - truth).abs().max() < 0.5
+
+
+def test_cameras_in_step_are_found_in_step():
+    session = replace(SPEC, clocks=Clocks()).generate()
+    found = search_offsets(Measurements.of(session.observations), 30)
+    assert found.offsets_frames.abs().max() < 0.2
+
+
+def test_a_body_at_rest_tells_nothing():
+    session = replace(SPEC, regimes=(), clocks=Clocks()).generate()
+    still = session.observations.keypoints[:, :1].expand(-1, 150, -1, -1)
+    noise = torch.randn(still.shape, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+    found = search_offsets(Measurements.of(replace(session.observations, keypoints=still + noise)), 30)
+    assert found.determined == (True, False, False, False)
+    assert all("too little motion" in reason for reason in found.reasons[1:])
+    assert (found.offsets_frames == 0).all()
+
+
+def test_a_motion_that_repeats_itself_has_no_single_offset():
+    session = replace(SPEC, frames=25, regimes=(), clocks=Clocks()).generate()
+    period = session.observations.keypoints
+    there_and_back = torch.cat([period, period.flip(1)], dim=1)
+    found = search_offsets(Measurements.of(replace(session.observations, keypoints=there_and_back.repeat(1, 6, 1, 1))), 60)
+    assert found.determined == (True, False, False, False)
+    assert (found.offsets_frames == 0).all()
+
+
+def test_a_camera_that_saw_nothing_is_left_out():
+    session = SPEC.generate()
+    keypoints = session.observations.keypoints.clone()
+    keypoints[2] = torch.nan
+    found = search_offsets(Measurements.of(replace(session.observations, keypoints=keypoints)), 30)
+    assert found.determined == (True, True, False, True)
+    assert "too few points" in found.reasons[2]
+    assert (found.offsets_frames - SPEC.fps * session.truth.time_offsets_s)[[1, 3]].abs().max() < 0.5
+
+
+def test_residuals_at_all_lags_are_those_of_each_lag():
+    """The spectra's sums against distances computed point by point; at the right lag of perfect views nothing remains."""
+    session = replace(SPEC, cameras=2, frames=40, regimes=(), clocks=Clocks()).generate()
+    places = session.observations.keypoints.movedim(-1, 1)
+    places, weights = places.nan_to_num(), session.observations.visible.double()
+    tracks = Tracks(places, weights, 10)
+    agreement = tracks.agreement(0, 1)
+    assert int(agreement.residual_px2.argmin()) == 10
+    assert agreement.residual_px2[10] < 1e-6
+    for lag in (-4, 3):
+        found = tracks.distances_px(0, 1, lag)
+        assert found is not None
+        distances = found[0][found[0].isfinite()]
+        assert len(distances) == round(float(agreement.points[lag + 10]))
+        # Taubin's ratio of sums is the mean of ratios to first order
+        assert 0.5 < distances.square().mean() / agreement.residual_px2[lag + 10] < 2.0
+
+
+def numbered(cameras: int, frames: int) -> Observations:
+    """Two points whose pixels tell camera and frame."""
+    camera, frame = torch.meshgrid(torch.arange(cameras), torch.arange(frames), indexing="ij")
+    keypoints = torch.stack([camera, frame], dim=-1)[:, :, None].expand(-1, -1, 2, -1).double()
+    return Observations(keypoints, torch.eye(3), Stick(0, 1, 1.0), confidence=torch.ones(cameras, frames, 2))
+
+
+def test_shifted_frames_stand_where_the_common_axis_has_them():
+    moved, first = shifted(numbered(3, 5), torch.tensor([0, 2, -3]))
+    assert first == 0
+    assert moved.num_frames == 5
+    frames = moved.keypoints[:, :, 0, 1]
+    nan = torch.nan
+    expected = torch.tensor([[0, 1, 2, 3, 4], [nan, nan, 0, 1, 2], [3, 4, nan, nan, nan]]).double()
+    torch.testing.assert_close(frames, expected, equal_nan=True)
+    assert moved.confidence is not None
+    assert torch.equal(moved.visible, moved.confidence > 0)
+
+
+def test_sessions_without_a_common_frame_are_refused():
+    with pytest.raises(ObservationError, match="no two cameras have a frame in common"):
+        shifted(numbered(2, 5), torch.tensor([0, 5]))
