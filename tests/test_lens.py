@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from torchstickcal import Calibration, Observations, calibrate
+from torchstickcal import Calibration, CalibrationLayer, Observations, calibrate
 from torchstickcal.benchmark.bound import camera_bound
 from torchstickcal.benchmark.cases import Case
 from torchstickcal.errors import ConfigError, ObservationError
@@ -128,6 +128,11 @@ def test_unknown_refinement_is_refused():
     with pytest.raises(ConfigError, match="unusable value"):
         calibrate(session().observations, refine=["focus"])  # pyright: ignore[reportArgumentType]
     assert with_refinements(("focal_shared",), ("focal", "radial")) == ("focal", "radial")
+
+
+def test_layer_refuses_to_refine():
+    with pytest.raises(ConfigError, match="takes lenses as given"):
+        CalibrationLayer(session().observations.sticks, {"extends": "default", "refine": ["focal"]})
 
 
 def test_saved_and_loaded(tmp_path):

@@ -12,7 +12,7 @@ from torch import Tensor, nn
 
 from torchstickcal.cameras import Intrinsics
 from torchstickcal.config import Config, Stage, load_config
-from torchstickcal.errors import CalibrationError, ObservationError
+from torchstickcal.errors import CalibrationError, ConfigError, ObservationError
 from torchstickcal.gradients import GradientMode, attach, gradient_mode
 from torchstickcal.initialise import initialise, triangulated
 from torchstickcal.objective import Objective
@@ -62,6 +62,9 @@ class CalibrationLayer(nn.Module):
         sticks: the stick or sticks, as of :class:`Observations`.
         config: as of :func:`torchstickcal.calibrate`; its solver does not matter to the gradients.
         gradient: ``implicit`` (exact), ``gauss_newton`` (approximate), ``unrolled``, or a :class:`GradientMode`.
+
+    Raises:
+        ConfigError: for an unusable configuration, or one that refines lenses.
     """
 
     def __init__(
@@ -73,6 +76,14 @@ class CalibrationLayer(nn.Module):
         super().__init__()
         self.sticks = (sticks,) if isinstance(sticks, Stick) else tuple(sticks)
         self.config = load_config(config)
+        if self.config.refine:
+            raise ConfigError(
+                "the layer takes lenses as given",
+                where="config.refine",
+                got=self.config.refine,
+                expected="nothing",
+                remedy="Calibrate once with refine, and give the layer the lenses found.",
+            )
         self.gradient = gradient_mode(gradient)
 
     def forward(
