@@ -12,7 +12,6 @@ from typing import TYPE_CHECKING, Any
 from torchstickcal.errors import CalibrationError
 
 if TYPE_CHECKING:
-    from torchstickcal.config import Config
     from torchstickcal.io import Truth
     from torchstickcal.metrics import PoseErrors
     from torchstickcal.pipeline import Callback
@@ -48,7 +47,7 @@ def _parser() -> argparse.ArgumentParser:
         "--refine",
         metavar="A,B|auto|none",
         help="what to find of the lenses: focal, focal_shared, principal_point, radial, none, or auto for what the data "
-        "contradict (default: as configured, else auto)",
+        "contradict (default: as configured)",
     )
     command.add_argument("--stick-length", metavar="M", type=float, help="length of the stick in metres, if not the session's")
     command.add_argument("--tensorboard", metavar="DIR", type=Path, help="write a TensorBoard log of the calibration")
@@ -120,15 +119,15 @@ def _calibrate(options: argparse.Namespace) -> int:
     observations, _ = read_session(options.session)
     if options.stick_length is not None:
         observations = observations.with_stick_length(options.stick_length)
-    calibration = calibrate(observations, config, _Progress(_monitor(options.tensorboard)), _refine(options.refine, config))
+    calibration = calibrate(observations, config, _Progress(_monitor(options.tensorboard)), _refine(options.refine))
     _write(calibration, options.out, {"session": str(options.session), "config": options.config})
     return _show(calibration, options.out)
 
 
-def _refine(option: str | None, config: Config) -> Any:
-    """What to refine: as the option says, else the configuration, else ``auto``."""
+def _refine(option: str | None) -> Any:
+    """What the option says to refine; None where the configuration decides."""
     if option in {None, "auto"}:
-        return config.refine or "auto" if option is None else "auto"
+        return option
     return [] if option == "none" else str(option).split(",")
 
 
