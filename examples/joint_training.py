@@ -22,8 +22,8 @@ On sessions held out (two cores, two minutes):
     camera places (mm)   242      146
     rotations (deg)      3.67     1.04
 
-Two processes compute the same loss and gradient as one. The rounding of float32 grows over the steps of the first training, to 0.3 %
-of the loss after 50 and some percent after 200, and the joint losses then differ by up to 3 %.
+Two processes compute the same loss and gradient as one. The rounding of float32 grows over the steps of the first training, to
+0.3 % of the loss after 50 and some percent after 200, and the joint losses then differ by up to 3 %.
 
 What is left is what the views agree on: the part of the wrong labels that another pose of the camera or another place of the
 point explains, and errors of the stick's ends, which set the scale, common to all views.
