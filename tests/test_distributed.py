@@ -39,6 +39,8 @@ def half(rank: int, folder: str) -> None:
     loss = model(keypoints()[rank : rank + 1])
     loss.backward()
     torch.save((loss.detach(), model.module.correction.grad), f"{folder}/{rank}.pt")
+    del loss, model
+    dist.barrier()
     dist.destroy_process_group()
 
 
