@@ -90,7 +90,7 @@ def assemble(
         seconds=dict(seconds),
         warnings=(
             *_warnings(observations, measurements, inliers, sigma_px),
-            *_lens_warnings(observations, measurements, refined, lenses, ratio, ratio_std),
+            *_lens_warnings(observations, measurements, lenses, ratio, ratio_std),
         ),
     )
 
@@ -117,7 +117,7 @@ def _focal(focal: FocalCheck, measurements: Measurements, cameras: Intrinsics, l
 
 
 def _lens_warnings(
-    observations: Observations, measurements: Measurements, refined: Sequence[str], lenses: Tensor, ratio: Tensor, std: Tensor
+    observations: Observations, measurements: Measurements, lenses: Tensor, ratio: Tensor, std: Tensor
 ) -> list[str]:
     """What was given and is contradicted, and what was to be found and could not be."""
     found: list[str] = []

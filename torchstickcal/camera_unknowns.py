@@ -55,7 +55,6 @@ class Kind(ABC):
     """One number per camera."""
 
     name: str
-    unit: str
 
     @abstractmethod
     def prior(self, cameras: Intrinsics) -> Tensor:
@@ -74,8 +73,6 @@ class Kind(ABC):
 class ClockKind(Kind):
     """A number that says when a camera looked: its column is the keypoints' motion in the image times a factor."""
 
-    unit = "frames"
-
     @abstractmethod
     def factor(self, motion: ImageMotion) -> Tensor:
         """(..., C, N)"""
@@ -92,7 +89,7 @@ class ClockKind(Kind):
 class Focal(Kind):
     """Logarithm of the true focal length over the given one."""
 
-    name, unit = "focal", ""
+    name = "focal"
 
     def prior(self, cameras: Intrinsics) -> Tensor:
         return torch.full_like(cameras.focal_px, _FOCAL_PRIOR)
@@ -113,8 +110,6 @@ class Centre(Kind):
     Args:
         axis: 0 for x, 1 for y.
     """
-
-    unit = "px"
 
     def __init__(self, axis: int) -> None:
         self.axis, self.name = axis, f"centre_{'xy'[axis]}"
@@ -138,8 +133,6 @@ class Radial(Kind):
     Args:
         order: 1 or 2.
     """
-
-    unit = ""
 
     def __init__(self, order: int) -> None:
         self.order, self.name = order, f"k{order}"

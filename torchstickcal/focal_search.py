@@ -14,7 +14,7 @@ from torchstickcal.config import Config
 from torchstickcal.errors import RigError
 from torchstickcal.initialise import initialise
 from torchstickcal.problem import Measurements, State
-from torchstickcal.solvers import IterationRecord
+from torchstickcal.solvers import unheard
 from torchstickcal.stages import Ruler, run_stage
 
 _RATIOS = (0.45, 0.55, 0.67, 0.82, 1.0, 1.22, 1.5, 1.83, 2.2)
@@ -50,7 +50,7 @@ def search_focal(
         except RigError as error:
             failure = error
             continue
-        state = run_stage(name, stage, trial, start, known, settings.solver, _ignore).state
+        state = run_stage(name, stage, trial, start, known, settings.solver, unheard).state
         residual = _median_residual(trial, state)
         if residual < best:
             best = residual
@@ -71,7 +71,3 @@ def _scaled(cameras: Intrinsics, ratio: float) -> Intrinsics:
 def _median_residual(measurements: Measurements, state: State) -> float:
     squared: Tensor = measurements.squared_residuals(state)
     return float(squared[measurements.visible].median())
-
-
-def _ignore(record: IterationRecord) -> None:
-    return

@@ -19,7 +19,7 @@ from torchstickcal.objective import Objective
 from torchstickcal.observations import Observations, Stick
 from torchstickcal.pipeline import points_used
 from torchstickcal.problem import Measurements, State
-from torchstickcal.solvers import IterationRecord
+from torchstickcal.solvers import unheard
 from torchstickcal.solvers.newton import polish
 from torchstickcal.stages import Ruler, StageResult, rulers, run_stage, scale_factors
 from torchstickcal.workers import map_on_workers
@@ -169,7 +169,7 @@ class CalibrationLayer(nn.Module):
         reached: list[tuple[Stage, StageResult]] = []
         with torch.no_grad():
             for name, stage in stages[last_free if warm else 0 :]:
-                reached.append((stage, run_stage(name, stage, measurements, state, known, self.config.solver, _ignore)))
+                reached.append((stage, run_stage(name, stage, measurements, state, known, self.config.solver, unheard)))
                 state = reached[-1][1].state
         decisive = reached[last_free - len(stages) :]
         tied = self._tied(given, measurements, decisive, known)
@@ -361,7 +361,3 @@ def _with_batch(result: LayerResult) -> LayerResult:
 def _without_batch(result: LayerResult) -> LayerResult:
     tensors = {field.name: getattr(result, field.name) for field in fields(result) if field.name != "status"}
     return replace(result, **{name: tensor[0] for name, tensor in tensors.items()})
-
-
-def _ignore(record: IterationRecord) -> None:
-    return

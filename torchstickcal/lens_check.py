@@ -15,10 +15,9 @@ import torch
 from torch import Tensor
 
 from torchstickcal.camera_unknowns import REFINEMENTS, CameraUnknowns
-from torchstickcal.losses import Loss, ReprojectionLoss, StickLengthLoss
-from torchstickcal.objective import Objective
 from torchstickcal.problem import Measurements, State
 from torchstickcal.solvers.normal_equations import NormalEquations
+from torchstickcal.uncertainty import normal_objective
 
 _EVERY = ("focal", "principal_point", "radial")
 _CHOICES = (
@@ -65,10 +64,8 @@ class LensCheck:
         self._cameras, self._groups = in_use, groups
         self._every = CameraUnknowns.of(_EVERY, in_use)
         looked_at = replace(measurements, cameras=in_use, unknowns=self._every, motion=None)
-        losses: dict[str, Loss] = {"reprojection": ReprojectionLoss(sigma_px[:, None, None])}
-        if len(measurements.pairs):
-            losses["stick_length"] = StickLengthLoss(sigma_length_m)
-        system = NormalEquations(Objective(looked_at, losses), replace(state, unknowns=None), cameras_free=True)
+        objective = normal_objective(looked_at, sigma_px, sigma_length_m)
+        system = NormalEquations(objective, replace(state, unknowns=None), cameras_free=True)
         self._information, self._gradient = system.reduced[0], system.reduced_gradient[0]
 
     def focal(self) -> FocalCheck:
@@ -85,11 +82,11 @@ class LensCheck:
             refined: the refinements made.
             failed: choices that have been tried in vain.
         """
-        best, choice = _SIGMAS**2, ()
+        best, choice, held = _SIGMAS**2, (), self._decrease(())
         for names in _CHOICES:
             if names in failed or with_refinements(refined, names) == tuple(refined):
                 continue
-            gain = self._decrease(names) - self._decrease(()) - _PRICE * CameraUnknowns.of(names, self._cameras).count
+            gain = self._decrease(names) - held - _PRICE * CameraUnknowns.of(names, self._cameras).count
             if gain > best:
                 best, choice = gain, names
         return choice

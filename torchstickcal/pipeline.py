@@ -21,7 +21,7 @@ from torchstickcal.lens_check import LensCheck, with_refinements
 from torchstickcal.observations import Observations
 from torchstickcal.problem import Measurements, State
 from torchstickcal.result import Calibration
-from torchstickcal.solvers import IterationRecord
+from torchstickcal.solvers import IterationRecord, unheard
 from torchstickcal.stages import StageRecord, StageResult, rulers, run_stage
 from torchstickcal.uncertainty import camera_covariance
 from torchstickcal.workers import on_worker
@@ -94,7 +94,7 @@ def _calibrated(observations: Observations, settings: Config, callback: Callback
     seconds = {"initialise": time.perf_counter() - began}
 
     records: list[StageRecord] = []
-    listener = callback.on_iteration if callback else _ignore
+    listener = callback.on_iteration if callback else unheard
 
     def run(stages: Mapping[str, Stage], start: State) -> StageResult:
         result: StageResult | None = None
@@ -171,7 +171,3 @@ def _covariance(measurements: Measurements, adjusted: StageResult, sigma_px: Ten
 def _sigma_length_m(adjusted: StageResult) -> Tensor | float:
     length = adjusted.losses.get("stick_length")
     return length.sigma if length is not None and length.weight == 1.0 else StickLengthSettings().sigma_m
-
-
-def _ignore(record: IterationRecord) -> None:
-    return

@@ -22,6 +22,14 @@ _POINTS_AT_ONCE = 2000
 _OPEN = 1e-12
 
 
+def normal_objective(measurements: Measurements, sigma_px: Tensor, sigma_length_m: Tensor | float) -> Objective:
+    """What the likeliest state minimises where noise is normal; arguments as of :func:`camera_covariance`."""
+    losses: dict[str, Loss] = {"reprojection": ReprojectionLoss(sigma_px[:, None, None])}
+    if len(measurements.pairs):
+        losses["stick_length"] = StickLengthLoss(sigma_length_m)
+    return Objective(measurements, losses)
+
+
 def camera_covariance(measurements: Measurements, state: State, sigma_px: Tensor, sigma_length_m: Tensor | float) -> Tensor:
     """Covariance of the tangents of all cameras but the first, metres and radians, and then of the cameras' K further unknowns.
 
@@ -34,10 +42,7 @@ def camera_covariance(measurements: Measurements, state: State, sigma_px: Tensor
         sigma_px: noise of each point's keypoints, (B, P).
         sigma_length_m: how well the lengths hold.
     """
-    losses: dict[str, Loss] = {"reprojection": ReprojectionLoss(sigma_px[:, None, None])}
-    if len(measurements.pairs):
-        losses["stick_length"] = StickLengthLoss(sigma_length_m)
-    information = NormalEquations(Objective(measurements, losses), state, cameras_free=True).reduced
+    information = NormalEquations(normal_objective(measurements, sigma_px, sigma_length_m), state, cameras_free=True).reduced
     scale = information.diagonal(dim1=1, dim2=2).clamp_min(1e-300).rsqrt()
     values, vectors = torch.linalg.eigh(information * scale[:, :, None] * scale[:, None])
     inverse = torch.where(values > _OPEN * values[:, -1:], values.reciprocal(), 0.0)

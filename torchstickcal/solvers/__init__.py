@@ -2,10 +2,21 @@
 
 from __future__ import annotations
 
-from torchstickcal.solvers.base import IterationRecord, Listener, Outcome, Solver, Stop, Termination
+from torchstickcal.solvers.base import IterationRecord, Listener, Outcome, Solver, Stop, Termination, unheard
 from torchstickcal.solvers.gauss_newton import gauss_newton
 
-__all__ = ["SOLVERS", "IterationRecord", "Listener", "Outcome", "Solver", "Stop", "Termination", "gauss_newton", "solver"]
+__all__ = [
+    "SOLVERS",
+    "IterationRecord",
+    "Listener",
+    "Outcome",
+    "Solver",
+    "Stop",
+    "Termination",
+    "gauss_newton",
+    "solver",
+    "unheard",
+]
 
 SOLVERS = ("gauss_newton", "lbfgs")
 

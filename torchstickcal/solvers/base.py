@@ -66,6 +66,10 @@ class IterationRecord:
 Listener = Callable[[IterationRecord], None]
 
 
+def unheard(record: IterationRecord) -> None:
+    """The listener where nobody listens."""
+
+
 @dataclass(frozen=True)
 class Outcome:
     """Where a solver ended, why, and how it got there, for B sessions."""
