@@ -2,136 +2,198 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 
 import torch
 from torch import Tensor
 
-from torchstickcal.cameras import Intrinsics
-from torchstickcal.lens_check import FocalCheck
-from torchstickcal.losses import reprojection_residuals
+from torchstickcal.adjust import Adjustment
+from torchstickcal.camera_check import CameraCheck
+from torchstickcal.camera_unknowns import CameraUnknowns
 from torchstickcal.observations import Observations
 from torchstickcal.problem import Measurements
 from torchstickcal.result import LENS_PARAMETERS, Calibration
-from torchstickcal.stages import StageRecord, StageResult
+from torchstickcal.synchronise import ClockEstimate
 
 _USELESS_FOCAL_SHARE = 0.03
 _CONTRADICTED_SIGMAS = 4.0
 _CONTRADICTED_SHARE = 0.005
+_CONTRADICTED_FRAMES = 0.02
 _OPEN_SHARE = 0.5
 
 
 def assemble(
     observations: Observations,
-    measurements: Measurements,
-    reached: StageResult,
+    reached: Adjustment,
     covariance: Tensor | None,
-    refined: Sequence[str],
-    focal: FocalCheck,
-    stages: Sequence[StageRecord],
+    check: CameraCheck,
+    clocks: ClockEstimate | None,
     seconds: Mapping[str, float],
-    session: int = 0,
 ) -> Calibration:
-    """The calibration of one session that the last of the stages has reached.
+    """The calibration of one session.
 
     Args:
         observations: the session as the user gave it.
-        measurements: all that could take part, of all sessions solved together.
-        reached: what the last stage ended with.
-        covariance: of the tangents of all sessions' cameras and of their further unknowns; None where no stage adjusted them.
-        refined: what else was found of the cameras.
-        focal: the focal lengths as the data have them.
-        stages: the records of this session's stages, in order.
+        reached: where its adjustment ended.
+        covariance: of the tangents of the cameras and of their further unknowns, (1, ...); None where no stage adjusted them.
+        check: what the data say of lenses and clocks there.
+        clocks: what a search for the clocks has found; None without one.
         seconds: time by step.
-        session: which of the sessions solved together it is.
     """
-    one = slice(session, session + 1)
-    measurements, inliers, sigma_px = measurements[one], reached.inliers[session], reached.sigma_px[session]
-    rotations, translations = reached.state.rotations[session], reached.state.translations[session]
-    points = measurements.by_frame(reached.state.points[session].where(inliers.any(0), torch.nan)).movedim(0, -1)
-    cameras = measurements.cameras_at(reached.state[one]).to(torch.float64)[0]
-    residuals = torch.empty_like(observations.keypoints, dtype=torch.float64)
-    for frames in measurements.frame_slices():
-        seen = (observations.visible[:, frames] & points[frames].isfinite().all(-1))[..., None]
-        keypoints = observations.keypoints[:, frames].double()
-        found = reprojection_residuals(points[frames], rotations, translations, keypoints, cameras)
-        residuals[:, frames] = found.where(seen, torch.nan)
+    frames, measurements, result = reached.frames, reached.measurements, reached.result
+    inliers, sigma_px = measurements.by_frame(result.inliers[0]), result.sigma_px[0]
+    points = measurements.by_frame(result.state.points[0]).where(inliers.any(0), torch.nan).movedim(0, -1)
+    cameras = measurements.cameras_at(result.state).to(torch.float64)[0]
     starts, ends = [stick.start for stick in observations.sticks], [stick.end for stick in observations.sticks]
     size, count = observations.image_size, observations.num_cameras
-    distortion = cameras.distortion if refined else observations.distortion
-    poses, lenses = _covariance(covariance, measurements, session)
-    ratio, ratio_std = _focal(focal, measurements, cameras, lenses)
+    distortion = cameras.distortion if reached.refined else observations.distortion
+    poses, stds = _covariance(covariance, measurements)
+    lens_std = torch.stack([stds.get(name, torch.zeros(count).to(points)) for name in LENS_PARAMETERS], dim=1)
+    ratio, ratio_std = _focal(check, cameras.focal_px / measurements.cameras.focal_px[0], lens_std[:, 0])
+    timing = _Timing(observations, reached, check, stds)
 
     def as_given(tensor: Tensor) -> Tensor:
         return tensor.to(observations.keypoints.dtype).contiguous()
 
     return Calibration(
-        rotations=as_given(rotations),
-        translations=as_given(translations),
+        rotations=as_given(result.state.rotations[0]),
+        translations=as_given(result.state.translations[0]),
         points=as_given(points),
         covariance=poses,
-        residuals_px=as_given(residuals),
-        inliers=measurements.by_frame(inliers),
+        residuals_px=as_given(frames.to_own(_residuals(reached), torch.nan)),
+        inliers=frames.to_own(inliers, False),
         stick_lengths_m=as_given((points[:, ends] - points[:, starts]).norm(dim=-1)),
         sigma_px=as_given(sigma_px),
         intrinsics=as_given(cameras.matrix),
         distortion=None if distortion is None else as_given(distortion.expand(count, distortion.shape[-1])),
-        refined=tuple(refined),
-        lens_std=as_given(lenses),
+        refined=reached.refined,
+        lens_std=as_given(lens_std),
         focal_ratio=as_given(ratio),
         focal_ratio_std=as_given(ratio_std),
+        time_offsets=as_given(timing.offsets),
+        time_offsets_std=as_given(timing.offsets_std),
+        readout=as_given(timing.readout),
+        readout_std=as_given(timing.readout_std),
+        late=as_given(timing.late),
+        late_std=as_given(timing.late_std),
+        frame_index=frames.index,
+        times=frames.times_s,
         image_size=None if size is None else size.expand(count, 2).round().long().contiguous(),
         fisheye=observations.fisheye,
         sticks=observations.sticks,
         fps=observations.fps,
         point_names=observations.point_names,
         camera_names=tuple(observations.camera_label(index) for index in range(count)),
-        stages=tuple(stages),
+        stages=reached.records,
         seconds=dict(seconds),
         warnings=(
             *_warnings(observations, measurements, inliers, sigma_px),
-            *_lens_warnings(observations, measurements, lenses, ratio, ratio_std),
+            *_lens_warnings(observations, ratio, ratio_std, lens_std[:, 0] > 0),
+            *timing.warnings(),
+            *_undetermined(observations, measurements, stds, clocks),
         ),
     )
 
 
-def _covariance(covariance: Tensor | None, measurements: Measurements, session: int) -> tuple[Tensor, Tensor]:
-    """That of the cameras' tangents, and standard deviations (C, 5) of what the lenses' parameters are."""
+def _residuals(reached: Adjustment) -> Tensor:
+    """Projections minus keypoints (C, G, P, 2) at the common frames, pixels; NaN where not seen or the point is not known."""
+    measurements, state = reached.measurements, reached.result.state
+    cameras, known = measurements.cameras_at(state), reached.result.inliers.any(1, keepdim=True)
+    residuals = torch.empty_like(measurements.pixels, dtype=torch.float64)
+    for columns in measurements.chunks():
+        x, y, z = state.in_cameras(columns, measurements.pixels.dtype).unbind(-2)
+        projected = torch.stack(cameras.project_components(x, y, z), dim=-2)
+        seen = (measurements.visible & known)[..., columns].unsqueeze(-2)
+        residuals[..., columns] = (projected - measurements.pixels_at(state, columns)).double().where(seen, torch.nan)
+    return measurements.by_frame(residuals[0]).movedim(1, -1)
+
+
+def _covariance(covariance: Tensor | None, measurements: Measurements) -> tuple[Tensor, dict[str, Tensor]]:
+    """That of the cameras' tangents, and each camera's standard deviation (C,) of what else was unknown, by its kind."""
     tangents = 6 * (measurements.num_cameras - 1)
-    stds = torch.zeros(measurements.num_cameras, len(LENS_PARAMETERS), dtype=torch.float64, device=measurements.pixels.device)
     if covariance is None:
-        return torch.full((tangents, tangents), torch.nan, dtype=torch.float64), stds
+        return torch.full((tangents, tangents), torch.nan, dtype=torch.float64), {}
     unknowns = measurements.unknowns
-    if unknowns is not None:
-        own = torch.einsum("ckj,jl,ckl->ck", unknowns.share, covariance[session, tangents:, tangents:], unknowns.share).sqrt()
-        for number, kind in enumerate(unknowns.kinds):
-            stds[:, LENS_PARAMETERS.index(kind.name)] = own[:, number]
-    return covariance[session, :tangents, :tangents], stds
+    if unknowns is None:
+        return covariance[0], {}
+    own = torch.einsum("ckj,jl,ckl->kc", unknowns.share, covariance[0, tangents:, tangents:], unknowns.share).sqrt()
+    return covariance[0, :tangents, :tangents], {kind.name: std for kind, std in zip(unknowns.kinds, own, strict=True)}
 
 
-def _focal(focal: FocalCheck, measurements: Measurements, cameras: Intrinsics, lenses: Tensor) -> tuple[Tensor, Tensor]:
+def _focal(check: CameraCheck, ratio: Tensor, std: Tensor) -> tuple[Tensor, Tensor]:
     """Each camera's focal length over the one given, with its standard deviation: as refined, else as checked."""
-    found = lenses[:, 0] > 0
-    ratio = cameras.focal_px / measurements.cameras.focal_px[0]
-    return torch.where(found, ratio, focal.ratio), torch.where(found, lenses[:, 0] * ratio, focal.std)
+    data = check.focal()
+    return torch.where(std > 0, ratio, data.ratio), torch.where(std > 0, std * ratio, data.std)
 
 
-def _lens_warnings(
-    observations: Observations, measurements: Measurements, lenses: Tensor, ratio: Tensor, std: Tensor
-) -> list[str]:
-    """What was given and is contradicted, and what was to be found and could not be."""
-    found: list[str] = []
+class _Timing:
+    """What is known of the cameras' clocks and shutters in the end, (C,) each, seconds; NaN without a frame rate."""
+
+    def __init__(self, observations: Observations, reached: Adjustment, check: CameraCheck, stds: Mapping[str, Tensor]) -> None:
+        self._observations, self._refined = observations, reached.refined
+        frames, unknowns, values = reached.frames, reached.measurements.unknowns, reached.result.state.unknowns
+        self._period_s = 1 / frames.rate_hz if frames.rate_hz is not None else torch.nan
+        nothing = torch.zeros_like(frames.offsets_frames)
+        own = {} if unknowns is None or values is None else _by_kind(unknowns, values)
+        given_s = observations.readout_s or 0.0
+        self.offsets = self._seconds(frames.offsets_frames + own.get("time_offset", nothing))
+        self.offsets_std = self._seconds(stds.get("time_offset", nothing))
+        self.readout = given_s + self._seconds(own.get("readout", nothing))
+        self.readout_std = self._seconds(stds.get("readout", nothing))
+        data = check.clocks()
+        self._late_frames = data.late_frames
+        self.late, self.late_std = self._seconds(data.late_frames), self._seconds(data.std)
+
+    def warnings(self) -> list[str]:
+        """Clocks that were taken as told and are contradicted."""
+        found: list[str] = []
+        if "time_offset" in self._refined:
+            return found
+        for camera, (late, std) in enumerate(zip(self.late.tolist(), self.late_std.tolist(), strict=True)):
+            noticeable = abs(float(self._late_frames[camera])) > _CONTRADICTED_FRAMES
+            if noticeable and abs(late) > _CONTRADICTED_SIGMAS * std:
+                label = self._observations.camera_label(camera)
+                found.append(f"{label} looks {1000 * late:.1f} +- {1000 * std:.1f} ms later than told, by the data.")
+        return found
+
+    def _seconds(self, frames: Tensor) -> Tensor:
+        return torch.where(frames == 0, 0.0, frames * self._period_s)
+
+
+def _by_kind(unknowns: CameraUnknowns, values: Tensor) -> dict[str, Tensor]:
+    """Each camera's own values (C,), by kind."""
+    return {kind.name: own for kind, own in zip(unknowns.kinds, unknowns.by_camera(values)[0].unbind(-1), strict=True)}
+
+
+def _lens_warnings(observations: Observations, ratio: Tensor, std: Tensor, found: Tensor) -> list[str]:
+    """Focal lengths that were given and are contradicted."""
+    if not observations.intrinsics_known:
+        return []
+    warnings: list[str] = []
     for camera, (value, sigma) in enumerate(zip(ratio.tolist(), std.tolist(), strict=True)):
-        if observations.intrinsics_known and abs(value - 1) > max(_CONTRADICTED_SIGMAS * sigma, _CONTRADICTED_SHARE):
-            used = "was found" if lenses[camera, 0] > 0 else "is what the data want, the given one was used"
-            found.append(f"{observations.camera_label(camera)}: {value:.4f} +- {sigma:.4f} of the given focal length {used}.")
+        if abs(value - 1) > max(_CONTRADICTED_SIGMAS * sigma, _CONTRADICTED_SHARE):
+            used = "was found" if found[camera] else "is what the data want, the given one was used"
+            warnings.append(
+                f"{observations.camera_label(camera)}: {value:.4f} +- {sigma:.4f} of the given focal length {used}."
+            )
+    return warnings
+
+
+def _undetermined(
+    observations: Observations, measurements: Measurements, stds: Mapping[str, Tensor], clocks: ClockEstimate | None
+) -> list[str]:
+    """What was to be found and could not be."""
+    found: list[str] = []
     unknowns = measurements.unknowns
     for kind in unknowns.kinds if unknowns is not None else ():
         prior = kind.prior(measurements.cameras[0])
-        open_ones = (lenses[:, LENS_PARAMETERS.index(kind.name)] > _OPEN_SHARE * prior).nonzero().flatten().tolist()
+        open_ones = (stds[kind.name] > _OPEN_SHARE * prior).nonzero().flatten().tolist() if kind.name in stds else []
         if open_ones:
             names = ", ".join(map(observations.camera_label, open_ones))
             found.append(f"{kind.name} stays near what was given, the data hardly tell it: {names}.")
+    for camera, reason in enumerate(clocks.reasons if clocks is not None else ()):
+        if reason:
+            found.append(f"{observations.camera_label(camera)}: no clock offset beyond a frame was found, {reason}.")
     return found
 
 

@@ -23,7 +23,6 @@ Columns = slice | Tensor
 _FOCAL_PRIOR = 0.1
 _CENTRE_PRIOR = 0.02
 _RADIAL_PRIOR = 0.3
-_CLOCK_PRIOR = 0.5
 
 
 class ImageMotion(NamedTuple):
@@ -33,10 +32,12 @@ class ImageMotion(NamedTuple):
     """(B, C, 2, N), pixels a frame"""
     row: Tensor
     """(B, C, N), the keypoint's row as a share of the image's height"""
+    reckoned: Tensor
+    """(B, K), values of the unknowns at which the keypoints were placed"""
 
     def at(self, columns: Columns) -> ImageMotion:
         """That of some of the columns N."""
-        return ImageMotion(self.velocity[..., columns], self.row[..., columns])
+        return ImageMotion(self.velocity[..., columns], self.row[..., columns], self.reckoned)
 
 
 class Sight(NamedTuple):
@@ -73,16 +74,18 @@ class Kind(ABC):
 class ClockKind(Kind):
     """A number that says when a camera looked: its column is the keypoints' motion in the image times a factor."""
 
+    prior_frames: float
+
     @abstractmethod
-    def factor(self, motion: ImageMotion) -> Tensor:
-        """(..., C, N)"""
+    def factor(self, row: Tensor) -> Tensor:
+        """The delay for a value of 1 of keypoints (..., C, N) whose rows are these shares of the image's height, frames."""
 
     def prior(self, cameras: Intrinsics) -> Tensor:
-        return torch.full_like(cameras.focal_px, _CLOCK_PRIOR)
+        return torch.full_like(cameras.focal_px, self.prior_frames)
 
     def column(self, sight: Sight) -> tuple[Tensor, Tensor]:
         assert sight.motion is not None
-        x, y = (sight.motion.velocity * self.factor(sight.motion).unsqueeze(-2)).unbind(-2)
+        x, y = (sight.motion.velocity * self.factor(sight.motion.row).unsqueeze(-2)).unbind(-2)
         return x, y
 
 
@@ -156,18 +159,20 @@ class TimeOffset(ClockKind):
     """How much later than reckoned with a camera's frames are, frames."""
 
     name = "time_offset"
+    prior_frames = 0.5
 
-    def factor(self, motion: ImageMotion) -> Tensor:
-        return torch.ones_like(motion.row)
+    def factor(self, row: Tensor) -> Tensor:
+        return torch.ones_like(row)
 
 
 class Readout(ClockKind):
     """How much longer than reckoned with it takes from the first row of an image to the last, frames."""
 
     name = "readout"
+    prior_frames = 2.0
 
-    def factor(self, motion: ImageMotion) -> Tensor:
-        return motion.row
+    def factor(self, row: Tensor) -> Tensor:
+        return row
 
 
 class Refinement(NamedTuple):
@@ -189,6 +194,9 @@ REFINEMENTS = {
     "readout": Refinement((Readout(),), shared=True),
 }
 """What may be refined, by the name that configurations use."""
+
+CLOCKS = {"time_offset", "readout"}
+"""Those that say when a camera looked."""
 
 
 @dataclass(frozen=True)
@@ -250,12 +258,24 @@ class CameraUnknowns:
             cameras = kind.applied(cameras, own)
         return cameras
 
-    def displaced(self, pixels: Tensor, values: Tensor, motion: ImageMotion | None) -> Tensor:
-        """Keypoints (B, C, 2, N) taken back to when the cameras were thought to look, at values (B, K)."""
+    def delays(self, row: Tensor, values: Tensor) -> Tensor:
+        """How much later than reckoned with keypoints (B, C, N) were exposed at values (B, K), frames.
+
+        Args:
+            row: their rows as shares of the image's height, (B, C, N).
+            values: of the unknowns.
+        """
+        delays = torch.zeros_like(row)
         for kind, own in zip(self.kinds, self.by_camera(values).unbind(-1), strict=True):
-            if isinstance(kind, ClockKind) and motion is not None:
-                pixels = pixels - motion.velocity * (kind.factor(motion) * own[..., None]).unsqueeze(-2)
-        return pixels
+            if isinstance(kind, ClockKind):
+                delays = delays + kind.factor(row) * own[..., None]
+        return delays
+
+    def displaced(self, pixels: Tensor, values: Tensor, motion: ImageMotion | None) -> Tensor:
+        """Keypoints (B, C, 2, N) placed at other values (B, K) of the clocks than those reckoned with."""
+        if motion is None:
+            return pixels
+        return pixels - motion.velocity * self.delays(motion.row, values - motion.reckoned).unsqueeze(-2)
 
     def columns(
         self, u: Tensor, v: Tensor, pixel: PixelMap, cameras: Intrinsics, motion: ImageMotion | None

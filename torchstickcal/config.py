@@ -24,7 +24,7 @@ _EXTENDS = "extends"
 _UNIONS = (types.UnionType, typing.Union)
 
 
-Refine = Literal["focal", "focal_shared", "principal_point", "radial"]
+Refine = Literal["focal", "focal_shared", "principal_point", "radial", "time_offset", "readout"]
 """What may be found of a camera beside its pose, as of :data:`torchstickcal.camera_unknowns.REFINEMENTS`."""
 
 
@@ -122,6 +122,9 @@ class Config:
         scale: a length between points, where the scale shall not come from the sticks.
         refine: what else is found of the cameras, in every stage that adjusts them; ``auto`` for what the data contradict.
         camera_groups: a label for each camera; those with the same share what is shared. Empty: all do.
+        synchronise: whether ``auto`` may find clocks to differ from what was told.
+        max_offset_s: largest offset of a camera from the first one that is searched for, seconds; where the motion repeats
+            itself, less than half its period.
     """
 
     stages: dict[str, Stage]
@@ -132,6 +135,8 @@ class Config:
     scale: ScaleSettings | None = None
     refine: list[Refine] | Literal["auto"] = field(default_factory=list)
     camera_groups: list[str] = field(default_factory=list)
+    synchronise: bool = True
+    max_offset_s: float = 2.0
 
 
 def config_names() -> list[str]:

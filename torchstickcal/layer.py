@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor, nn
 
+from torchstickcal.adjust import points_used
 from torchstickcal.cameras import Intrinsics
 from torchstickcal.config import Config, Stage, load_config
 from torchstickcal.errors import CalibrationError, ConfigError, ObservationError
@@ -17,7 +18,6 @@ from torchstickcal.gradients import GradientMode, attach, gradient_mode
 from torchstickcal.initialise import initialise, triangulated
 from torchstickcal.objective import Objective
 from torchstickcal.observations import Observations, Stick
-from torchstickcal.pipeline import points_used
 from torchstickcal.problem import Measurements, State
 from torchstickcal.solvers import unheard
 from torchstickcal.solvers.newton import polish

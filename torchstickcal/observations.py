@@ -66,6 +66,10 @@ class Observations:
         fps: frames per second.
         point_names: P names. camera_names: C names.
         fisheye: whether ``distortion`` (D = 4) is of OpenCV's fisheye model.
+        timestamps: (C, F) or (F,), seconds, when each camera's frames begin, for cameras of different frame rates or with
+            dropped frames; NaN where a camera has no frame. None for frames that begin together.
+        readout_s: time from the first row of an image to the last, of rolling shutters, seconds; None for none. Needs image
+            size and frame rate.
 
     Arrays, lists and tensors are accepted and kept as tensors with the given values, shape and dtype; results of a
     calibration come back in the dtype and on the device of ``keypoints``.
@@ -86,6 +90,8 @@ class Observations:
     fisheye: bool = False
     intrinsics_known: bool = True
     """False where ``intrinsics`` is a guess from the image size"""
+    timestamps: Tensor | None = None
+    readout_s: float | None = None
     visible: Tensor = field(init=False, repr=False, compare=False)
     """(C, F, P), True where a keypoint is given with a confidence above 0."""
 
@@ -102,6 +108,8 @@ class Observations:
         camera_names: Sequence[str] | None = None,
         fisheye: bool = False,
         intrinsics_known: bool = True,
+        timestamps: Any = None,
+        readout_s: float | None = None,
     ) -> None:
         put = object.__setattr__
         put(self, "keypoints", _tensor(keypoints, "keypoints"))
@@ -112,13 +120,16 @@ class Observations:
         for name, value in (("distortion", distortion), ("confidence", confidence), ("image_size", image_size)):
             put(self, name, None if value is None else _tensor(value, name, device))
         put(self, "fps", None if fps is None else float(fps))
+        put(self, "timestamps", None if timestamps is None else _times(timestamps, self.keypoints))
+        put(self, "readout_s", None if readout_s is None else float(readout_s))
         put(self, "point_names", None if point_names is None else tuple(map(str, point_names)))
         put(self, "camera_names", None if camera_names is None else tuple(map(str, camera_names)))
         put(self, "fisheye", bool(fisheye))
         self._check_keypoints()
         self._check_intrinsics()
         self._check_confidence()
-        self._check_names_and_rate()
+        self._check_names()
+        self._check_times()
         visible = self.keypoints.isfinite().all(-1)
         put(self, "visible", visible if self.confidence is None else visible & (self.confidence > 0))
         self._check_sticks()
@@ -259,7 +270,7 @@ class Observations:
         if outside.any():
             _refuse_first("confidence outside [0, 1]", outside, confidence, "a number from 0 to 1", where="confidence")
 
-    def _check_names_and_rate(self) -> None:
+    def _check_names(self) -> None:
         for where, names, count in (
             ("point_names", self.point_names, self.num_points),
             ("camera_names", self.camera_names, self.num_cameras),
@@ -268,8 +279,43 @@ class Observations:
                 raise ObservationError(
                     "names do not fit the keypoints", where=where, got=names, expected=f"{count} different names"
                 )
+
+    def _check_times(self) -> None:
         if self.fps is not None and not (np.isfinite(self.fps) and self.fps > 0):
             raise ObservationError("frame rate is not usable", where="fps", got=self.fps, expected="a number above 0")
+        if self.timestamps is not None:
+            shape = tuple(self.keypoints.shape[:2])
+            if tuple(self.timestamps.shape) != shape:
+                raise ObservationError(
+                    "timestamps have the wrong shape",
+                    where="timestamps",
+                    got=tuple(self.timestamps.shape),
+                    expected=f"{shape} or {shape[1:]}: seconds, for each frame of each camera",
+                )
+            for index, times in enumerate(self.timestamps):
+                known = times[~times.isnan()]
+                if len(known) < 2 or not known.isfinite().all() or not bool((known.diff() > 0).all()):
+                    raise ObservationError(
+                        "timestamps do not increase",
+                        where=f"timestamps[{index}]",
+                        got=known.tolist()[:5],
+                        expected="seconds, each later than the one before; NaN where the camera has no frame",
+                    )
+            unplaced = self.timestamps.isnan()[..., None] & self.keypoints.isfinite().all(-1)
+            if unplaced.any():
+                _refuse_first("a keypoint in a frame without a timestamp", unplaced, self.keypoints, "a time, or NaN keypoints")
+        if self.readout_s is not None:
+            if not (np.isfinite(self.readout_s) and self.readout_s >= 0):
+                raise ObservationError(
+                    "not a read-out time", where="readout_s", got=self.readout_s, expected="seconds, 0 or more"
+                )
+            if self.image_size is None or (self.fps is None and self.timestamps is None):
+                raise ObservationError(
+                    "a read-out time without what it is counted in",
+                    where="readout_s",
+                    got=f"image_size {self.image_size}, fps {self.fps}",
+                    expected="image_size, and fps or timestamps",
+                )
 
     def _check_sticks(self) -> None:
         ends: list[int] = []
@@ -312,6 +358,12 @@ def _tensor(value: Any, name: str, device: torch.device | None = None) -> Tensor
     if tensor.is_complex() or tensor.dtype == torch.bool:
         raise ObservationError("not an array of real numbers", where=name, got=tensor.dtype, expected="real numbers")
     return tensor.to(device=device, dtype=tensor.dtype if tensor.is_floating_point() else torch.float64)
+
+
+def _times(timestamps: Any, keypoints: Tensor) -> Tensor:
+    """Timestamps (C, F), of those of each camera or of those common to all (F,)."""
+    times = _tensor(timestamps, "timestamps", keypoints.device)
+    return times.expand(len(keypoints), -1) if times.ndim == 1 else times
 
 
 def _guess(image_size: Any) -> Tensor:

@@ -22,7 +22,7 @@ from torchstickcal.solvers import IterationRecord, Stop
 from torchstickcal.stages import StageRecord
 from torchstickcal.uncertainty import centre_covariances, point_covariances, relative_scale_std
 
-_FORMAT = "torchstickcal calibration 3"
+_FORMAT = "torchstickcal calibration 4"
 _TENSORS = (
     "rotations",
     "translations",
@@ -36,8 +36,15 @@ _TENSORS = (
     "lens_std",
     "focal_ratio",
     "focal_ratio_std",
+    "time_offsets",
+    "time_offsets_std",
+    "readout",
+    "readout_std",
+    "late",
+    "late_std",
+    "frame_index",
 )
-_OPTIONAL_TENSORS = ("distortion", "image_size")
+_OPTIONAL_TENSORS = ("distortion", "image_size", "times")
 
 LENS_PARAMETERS = ("focal", "centre_x", "centre_y", "k1", "k2")
 """What may be found of a lens, in the order of :attr:`Calibration.lens_std`."""
@@ -55,7 +62,8 @@ class Calibration:
     translations: Tensor
     """(C, 3), world to camera, metres"""
     points: Tensor
-    """(F, P, 3), metres; NaN where fewer than two cameras saw the point"""
+    """(G, P, 3), metres, at the common frames; NaN where fewer than two cameras saw the point. The common frames are the F
+    frames of the session, unless the cameras' clocks were found apart or timestamps were given."""
     covariance: Tensor
     """(6 (C - 1), 6 (C - 1)), float64, of the tangents (translation, rotation; metres, radians) of all cameras but the first,
     which is the world: ``T_true = T Exp(tangent)``. For sticks whose lengths are as given, and normal noise."""
@@ -64,7 +72,7 @@ class Calibration:
     inliers: Tensor
     """(C, F, P), True where a keypoint took part to the end: seen by a second camera too, and agreeing with the others"""
     stick_lengths_m: Tensor
-    """(F, S), reconstructed lengths; NaN where an end is not known"""
+    """(G, S), reconstructed lengths; NaN where an end is not known"""
     sigma_px: Tensor
     """(P,), estimated noise of each point's keypoints along an axis, pixels"""
     intrinsics: Tensor
@@ -80,6 +88,23 @@ class Calibration:
     """(C,), the focal length that the data have over the one given: as found, else as far as one linearisation tells"""
     focal_ratio_std: Tensor
     """(C,), its standard deviation"""
+    time_offsets: Tensor
+    """(C,), how much later than told a camera's frames begin, against the first camera, seconds; as found, else zero"""
+    time_offsets_std: Tensor
+    """(C,), standard deviations, zero where taken as told"""
+    readout: Tensor
+    """(C,), time from the first row of an image to the last, seconds, as given or as found"""
+    readout_std: Tensor
+    """(C,), standard deviations, zero where taken as given"""
+    late: Tensor
+    """(C,), how much later than reckoned with a camera looks by the data, as far as one linearisation tells, seconds; about
+    zero where clocks are right or found, NaN where the session has no frame rate"""
+    late_std: Tensor
+    """(C,), its standard deviation"""
+    frame_index: Tensor
+    """(C, F), the common frame (of G) that a camera's frame was nearest to, -1 where it was left out"""
+    times: Tensor | None
+    """(G,), float64, when the common frames are on the first camera's clock, seconds; None without a frame rate"""
     image_size: Tensor | None
     """(C, 2), width and height, pixels"""
     fisheye: bool
@@ -133,10 +158,13 @@ class Calibration:
 
     @property
     def points_std_m(self) -> Tensor:
-        """(F, P), standard deviation of the distance of each point from where it is, stick lengths and smoothness aside."""
+        """(G, P), standard deviation of the distance of each point from where it is, stick lengths and smoothness aside."""
         frames, points = self.points.shape[:2]
         sigma_px = self.sigma_px.double().expand(frames, points).flatten()
-        found = self._point_covariances(self.points.double().flatten(0, 1), self.inliers.flatten(1), sigma_px)
+        seen = self.inliers.new_zeros(len(self.inliers), frames, points)
+        cameras, own = (self.frame_index >= 0).nonzero(as_tuple=True)
+        seen[cameras, self.frame_index[cameras, own]] = self.inliers[cameras, own]
+        found = self._point_covariances(self.points.double().flatten(0, 1), seen.flatten(1), sigma_px)
         return found.diagonal(dim1=1, dim2=2).sum(1).sqrt().to(self.points.dtype).view(frames, points)
 
     def predict_std(self, points: Tensor, sigma_px: float | None = None) -> Tensor:
@@ -217,6 +245,7 @@ class Calibration:
                 **{name: arrays[name] for name in _TENSORS},
                 distortion=arrays.get("distortion"),
                 image_size=arrays.get("image_size"),
+                times=arrays.get("times"),
                 fisheye=meta["fisheye"],
                 refined=tuple(meta["refined"]),
                 sticks=tuple(Stick(*stick) for stick in meta["sticks"]),

@@ -50,6 +50,19 @@ def camera_covariance(measurements: Measurements, state: State, sigma_px: Tensor
     return (vectors * inverse[:, None]) @ vectors.mT
 
 
+def point_variances(measurements: Measurements, state: State, sigma_px: Tensor) -> Tensor:
+    """Mean variance along the axes of each point (B, N), the cameras known, square metres; infinite where none is seen.
+
+    Args:
+        measurements: those that took part.
+        state: the cameras and points.
+        sigma_px: noise of each point's keypoints, (B, P).
+    """
+    objective = Objective(measurements, {"reprojection": ReprojectionLoss(sigma_px[:, None, None])})
+    variance = NormalEquations(objective, state, cameras_free=False).point_variance().double()
+    return variance.where(measurements.active, torch.inf)
+
+
 def centre_covariances(centres: Tensor, covariance: Tensor) -> Tensor:
     """Covariances (C, 3, 3) of camera centres (C, 3), square metres, of that of the tangents; zero for the first."""
     by_tangents = -_motion(centres[1:])

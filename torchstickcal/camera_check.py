@@ -1,13 +1,13 @@
-"""Do the lenses as given agree with the data? What they would be if they were unknown, from one linearisation at the solution.
+"""Do lenses and clocks as given agree with the data? What they would be if they were unknown, from one linearisation.
 
-The reduced camera system is built with a column for every lens parameter of every camera. Any choice of parameters, own or
-shared, is then a small system in which the others are held, and the decrease of the cost that it promises says how much the
-data want it.
+At the solution the reduced camera system is built with a column for every parameter of every camera. Any choice of parameters,
+own or shared, is then a small system in which the others are held, and the decrease of the cost that it promises says how much
+the data want it.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -19,8 +19,11 @@ from torchstickcal.problem import Measurements, State
 from torchstickcal.solvers.normal_equations import NormalEquations
 from torchstickcal.uncertainty import normal_objective
 
-_EVERY = ("focal", "principal_point", "radial")
+_EVERY = ("focal", "principal_point", "radial", "time_offset", "readout")
 _CHOICES = (
+    ("time_offset",),
+    ("readout",),
+    ("time_offset", "readout"),
     ("focal_shared",),
     ("focal",),
     ("radial",),
@@ -46,11 +49,20 @@ class FocalCheck(NamedTuple):
     """(C,), of the ratio"""
 
 
-class LensCheck:
-    """One session's cameras at a solution, looked at as if their lenses were unknown.
+class ClockCheck(NamedTuple):
+    """When each camera looks as the data have it, all else being as it is."""
+
+    late_frames: Tensor
+    """(C,), how much later than reckoned with, against the first camera"""
+    std: Tensor
+    """(C,), zero for the first camera"""
+
+
+class CameraCheck:
+    """One session's cameras at a solution, looked at as if their lenses and clocks were unknown.
 
     Args:
-        measurements: those that took part.
+        measurements: those that took part, with their motion.
         state: the solution.
         sigma_px: noise of each point's keypoints, (1, P).
         sigma_length_m: how well the sticks' lengths hold.
@@ -60,10 +72,17 @@ class LensCheck:
     def __init__(
         self, measurements: Measurements, state: State, sigma_px: Tensor, sigma_length_m: float | Tensor, groups: Sequence[str]
     ) -> None:
-        in_use = measurements.cameras_at(state).to(torch.float64)
+        in_use, motion = measurements.cameras_at(state).to(torch.float64), measurements.motion
+        assert motion is not None
         self._cameras, self._groups = in_use, groups
         self._every = CameraUnknowns.of(_EVERY, in_use)
-        looked_at = replace(measurements, cameras=in_use, unknowns=self._every, motion=None)
+        looked_at = replace(
+            measurements,
+            pixels=measurements.pixels_at(state),
+            cameras=in_use,
+            unknowns=self._every,
+            motion=motion._replace(reckoned=torch.zeros_like(self._every.prior_sigma)),
+        )
         objective = normal_objective(looked_at, sigma_px, sigma_length_m)
         system = NormalEquations(objective, replace(state, unknowns=None), cameras_free=True)
         self._information, self._gradient = system.reduced[0], system.reduced_gradient[0]
@@ -73,23 +92,34 @@ class LensCheck:
         values, covariance = self._solved(("focal",))
         return FocalCheck(values.exp(), covariance.diagonal().sqrt())
 
-    def wanted(self, refined: Sequence[str] = (), failed: Sequence[tuple[str, ...]] = ()) -> tuple[str, ...]:
-        """The refinements that the data call for beside those made; none where the lenses in use agree with the data.
+    def clocks(self) -> ClockCheck:
+        """The clocks, each camera's on its own but the first's."""
+        values, covariance = self._solved(("time_offset",))
+        late, std = (torch.nn.functional.pad(own, (1, 0)) for own in (values, covariance.diagonal().sqrt()))
+        return ClockCheck(late, std)
 
-        Each choice is judged by the decrease of the cost it promises, less a price for each of its parameters.
+    def wanted(
+        self, allowed: Collection[str], refined: Sequence[str] = (), failed: Sequence[tuple[str, ...]] = ()
+    ) -> tuple[str, ...]:
+        """The refinements that the data call for beside those made; none where the cameras in use agree with the data.
 
         Args:
+            allowed: what may be refined.
             refined: the refinements made.
             failed: choices that have been tried in vain.
         """
-        best, choice, held = _SIGMAS**2, (), self._decrease(())
+        best, choice = _SIGMAS**2, ()
         for names in _CHOICES:
-            if names in failed or with_refinements(refined, names) == tuple(refined):
+            if names in failed or not set(names) <= set(allowed) or with_refinements(refined, names) == tuple(refined):
                 continue
-            gain = self._decrease(names) - held - _PRICE * CameraUnknowns.of(names, self._cameras).count
+            gain = self.gain(names)
             if gain > best:
                 best, choice = gain, names
         return choice
+
+    def gain(self, names: tuple[str, ...]) -> float:
+        """Decrease of the cost that a choice promises, less a price for each of its parameters."""
+        return self._decrease(names) - self._decrease(()) - _PRICE * CameraUnknowns.of(names, self._cameras).count
 
     def _decrease(self, names: tuple[str, ...]) -> float:
         chosen = self._chosen(names)

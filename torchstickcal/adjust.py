@@ -1,0 +1,243 @@
+"""One session's adjustment: initialised, brought through its stages, with lenses and clocks among the unknowns."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from torchstickcal.camera_check import CameraCheck, with_refinements
+from torchstickcal.camera_unknowns import CLOCKS, REFINEMENTS, CameraUnknowns
+from torchstickcal.config import Config, Stage, StickLengthSettings
+from torchstickcal.errors import ConfigError, ObservationError
+from torchstickcal.focal_search import search_focal
+from torchstickcal.initialise import initialise
+from torchstickcal.observations import Observations
+from torchstickcal.problem import Measurements, State
+from torchstickcal.solvers import Listener
+from torchstickcal.stages import StageRecord, StageResult, rulers, run_stage
+from torchstickcal.synchronise import ClockEstimate, CommonFrames, Exposures, on_common_frames, search_offsets
+from torchstickcal.uncertainty import camera_covariance, point_variances
+
+_CLOCK_STAGE = "clocks"
+_MAX_CLOCK_ROUNDS = 10
+_MOVED_SIGMAS = 0.02
+"""Root mean square movement of the keypoints, in standard deviations of their noise, at which the clocks have converged."""
+
+
+@dataclass(frozen=True)
+class Adjustment:
+    """A session with its cameras adjusted."""
+
+    frames: CommonFrames
+    seen: Measurements
+    """the keypoints as seen, on the common frames, with the unknowns"""
+    measurements: Measurements
+    """the same, brought to the common clock"""
+    refined: tuple[str, ...]
+    """what is found of the cameras beside their poses"""
+    result: StageResult
+    records: tuple[StageRecord, ...]
+
+    @property
+    def kept(self) -> Measurements:
+        """The measurements that took part to the end."""
+        return self.measurements.keeping(self.result.inliers)
+
+    @property
+    def converged(self) -> bool:
+        """Whether every stage did."""
+        return all(record.stop.converged for record in self.records)
+
+    @property
+    def median_residual(self) -> float:
+        """Median squared residual of all keypoints, square pixels."""
+        return float(self.measurements.squared_residuals(self.result.state)[self.measurements.visible].median())
+
+    def covariance(self, sigma_px: Tensor) -> Tensor | None:
+        """That of the cameras where they were adjusted, for a noise (1, P) of the points' keypoints."""
+        if not self.result.cameras_free:
+            return None
+        return camera_covariance(self.kept, self.result.state, sigma_px, self.sigma_length_m)
+
+    @property
+    def sigma_length_m(self) -> Tensor | float:
+        """How well the sticks' lengths hold."""
+        length = self.result.losses.get("stick_length")
+        return length.sigma if length is not None and length.weight == 1.0 else StickLengthSettings().sigma_m
+
+
+class Adjuster:
+    """Adjusts one session in different ways: at other clock offsets, with other unknowns.
+
+    Args:
+        observations: the session.
+        settings: the configuration.
+        listener: hears every iteration.
+    """
+
+    def __init__(self, observations: Observations, settings: Config, listener: Listener) -> None:
+        self._observations, self._settings, self._listener = observations, settings, listener
+        self._known = rulers([observations], settings)
+        self._adjusting, self._holding = _split(settings.stages)
+        self.seconds: dict[str, float] = {}
+        """time by step"""
+
+    @property
+    def refinable(self) -> set[str]:
+        """What the session allows to refine: clocks are counted in frames a second, a shutter in rows of the image."""
+        given = self._observations
+        names = set(REFINEMENTS) - CLOCKS
+        if given.fps is not None or given.timestamps is not None:
+            names |= CLOCKS if given.image_size is not None else {"time_offset"}
+        return names
+
+    def search(self) -> ClockEstimate:
+        """The clocks' offsets by the motion in the images."""
+        frames = on_common_frames(self._observations)
+        assert frames.rate_hz is not None
+        return search_offsets(self._seen(frames), self._settings.max_offset_s * frames.rate_hz)
+
+    def _seen(self, frames: CommonFrames) -> Measurements:
+        """The keypoints that may take part."""
+        precision = torch.float32 if self._settings.precision == "float32" else torch.float64
+        return Measurements.of(frames.observations, points_used(self._observations, self._settings), precision)
+
+    def begin(self, refined: Sequence[str], offsets_frames: Tensor | None = None) -> Adjustment:
+        """Adjust from nothing.
+
+        Args:
+            refined: what to find of the cameras beside their poses.
+            offsets_frames: (C,), how much later than reckoned the cameras' frames begin; None for not at all.
+
+        Raises:
+            RigError: if the cameras cannot be placed in one rig.
+        """
+        began = time.perf_counter()
+        frames = on_common_frames(self._observations, offsets_frames)
+        seen, given = self._seen(frames), self._observations
+        labels = [given.camera_label(index) for index in range(given.num_cameras)]
+        if given.intrinsics_known:
+            state = initialise(seen, self._settings.initialise, labels)
+        else:
+            seen, state = search_focal(seen, self._settings, labels, self._known)
+            refined = refined if "focal" in refined else with_refinements(refined, ("focal_shared",))
+        self._took("initialise", time.perf_counter() - began)
+        return self._adjusted(frames, seen, refined, state)
+
+    def again(self, adjustment: Adjustment, refined: Sequence[str]) -> Adjustment:
+        """Adjust again from where an adjustment ended, with something else refined."""
+        start = replace(adjustment.result.state, unknowns=None)
+        return self._adjusted(adjustment.frames, adjustment.seen, refined, start)
+
+    def held(self, adjustment: Adjustment) -> Adjustment:
+        """The stages that follow once the cameras are found."""
+        if not self._holding:
+            return adjustment
+        records = list(adjustment.records)
+        result = self._through(self._holding, adjustment.measurements, adjustment.result.state, records)
+        return replace(adjustment, result=result, records=tuple(records))
+
+    def check(self, adjustment: Adjustment) -> CameraCheck:
+        """What the data say of lenses and clocks where an adjustment ended."""
+        placed = _placed(Exposures.of(adjustment.frames), adjustment.seen, adjustment.measurements, adjustment.result)
+        kept = placed.keeping(adjustment.result.inliers)
+        result, groups = adjustment.result, self._settings.camera_groups
+        return CameraCheck(kept, result.state, result.sigma_px, adjustment.sigma_length_m, groups)
+
+    def _adjusted(self, frames: CommonFrames, seen: Measurements, refined: Sequence[str], state: State) -> Adjustment:
+        """Through the stages that adjust the cameras; where keypoints were not exposed together, the last one again and
+        again, with the keypoints brought to the common clock by the motion found so far."""
+        unknown = self._refining(seen, refined)
+        exposures, records = Exposures.of(frames), []
+        measurements = exposures.resting(unknown)
+        result = self._through(self._adjusting, measurements, state, records)
+        if exposures.apart or CLOCKS & set(refined):
+            last = list(self._adjusting.values())[-1]
+            for number in range(_MAX_CLOCK_ROUNDS):
+                placed = _placed(exposures, unknown, measurements, result)
+                moved = _movement(placed, measurements, result)
+                measurements = placed
+                if number > 0 and moved < _MOVED_SIGMAS:
+                    break
+                result = self._run(_CLOCK_STAGE, last, measurements, result.state, records)
+        return Adjustment(frames, unknown, measurements, tuple(refined), result, tuple(records))
+
+    def _through(
+        self, stages: Mapping[str, Stage], measurements: Measurements, state: State, records: list[StageRecord]
+    ) -> StageResult:
+        result: StageResult | None = None
+        for name, stage in stages.items():
+            result = self._run(name, stage, measurements, state, records)
+            state = result.state
+        assert result is not None
+        return result
+
+    def _run(
+        self, name: str, stage: Stage, measurements: Measurements, state: State, records: list[StageRecord]
+    ) -> StageResult:
+        result = run_stage(name, stage, measurements, state, self._known, self._settings.solver, self._listener)
+        records.extend(result.records)
+        self._took(name, records[-1].seconds)
+        return result
+
+    def _took(self, step: str, seconds: float) -> None:
+        self.seconds[step] = self.seconds.get(step, 0.0) + seconds
+
+    def _refining(self, seen: Measurements, names: Sequence[str]) -> Measurements:
+        """Measurements with some of :data:`torchstickcal.camera_unknowns.REFINEMENTS` among the unknowns.
+
+        Raises:
+            ConfigError: if there are camera groups, but not a label for each camera.
+            ObservationError: if clocks are asked for without what they are counted in.
+        """
+        groups = self._settings.camera_groups
+        if groups and len(groups) != seen.num_cameras:
+            raise ConfigError(
+                "camera groups do not fit the cameras",
+                where="camera_groups",
+                got=f"{len(groups)} labels",
+                expected=f"{seen.num_cameras}, one for each camera",
+            )
+        impossible = set(names) - self.refinable
+        if impossible:
+            raise ObservationError(
+                "clocks without what they are counted in",
+                where="refine",
+                got=", ".join(sorted(impossible)),
+                expected="fps or timestamps, and for readout the image size",
+            )
+        return replace(seen, unknowns=CameraUnknowns.of(names, seen.cameras, groups) if names else None)
+
+
+def points_used(observations: Observations, config: Config) -> list[int] | None:
+    """The points that take part; None for all."""
+    ends = {end for stick in observations.sticks for end in (stick.start, stick.end)}
+    if config.points == "sticks":
+        return sorted(ends)
+    if config.points == "joints":
+        return [point for point in range(observations.num_points) if point not in ends]
+    return None
+
+
+def _split(stages: Mapping[str, Stage]) -> tuple[dict[str, Stage], dict[str, Stage]]:
+    """The stages up to the last that adjusts the cameras, and those after it."""
+    names = list(stages)
+    last = max((number for number, name in enumerate(names) if stages[name].cameras == "free"), default=len(names) - 1)
+    return {name: stages[name] for name in names[: last + 1]}, {name: stages[name] for name in names[last + 1 :]}
+
+
+def _placed(exposures: Exposures, seen: Measurements, adjusted: Measurements, result: StageResult) -> Measurements:
+    """Keypoints as seen, brought to the common clock by the motion that a stage has found from those adjusted."""
+    variance = point_variances(adjusted.keeping(result.inliers), result.state, result.sigma_px)
+    return exposures.placed(seen, result.state, variance, result.sigma_px)
+
+
+def _movement(placed: Measurements, before: Measurements, result: StageResult) -> float:
+    """Root mean square distance between keypoints as placed and as they were before, in standard deviations."""
+    squared = (placed.pixels_at(result.state) - before.pixels_at(result.state)).square().sum(-2)
+    squared = before.by_frame(squared) / result.sigma_px[:, None, None].square().to(squared)
+    return float(squared[before.by_frame(result.inliers)].mean().sqrt())
