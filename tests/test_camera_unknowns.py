@@ -45,8 +45,10 @@ def unknown_rig(measurements: Measurements, state: State, names: tuple[str, ...]
         frames=5,
         cameras=cameras,
         unknowns=CameraUnknowns.of(names, cameras, groups=[0, 0, 1, 1]),
-        motion=ImageMotion(velocity, row),
     )
+    assert measurements.unknowns is not None
+    reckoned = 0.2 * measurements.unknowns.prior_sigma
+    measurements = dataclasses.replace(measurements, motion=ImageMotion(velocity, row, reckoned))
     assert measurements.unknowns is not None
     values = 0.3 * measurements.unknowns.prior_sigma * torch.randn(1, measurements.unknowns.count, generator=generator)
     return measurements, dataclasses.replace(state, points=state.points[..., columns].contiguous(), unknowns=values)

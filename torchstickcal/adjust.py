@@ -24,8 +24,8 @@ from torchstickcal.uncertainty import camera_covariance, point_variances
 
 _CLOCK_STAGE = "clocks"
 _MAX_CLOCK_ROUNDS = 10
-_MOVED_SIGMAS = 0.02
-"""Root mean square movement of the keypoints, in standard deviations of their noise, at which the clocks have converged."""
+_MOVED_SHARE, _MOVED_SIGMAS = 0.9, 0.01
+"""The clocks have converged when this share of the keypoints has moved by less than so many standard deviations."""
 
 
 @dataclass(frozen=True)
@@ -237,7 +237,7 @@ def _placed(exposures: Exposures, seen: Measurements, adjusted: Measurements, re
 
 
 def _movement(placed: Measurements, before: Measurements, result: StageResult) -> float:
-    """Root mean square distance between keypoints as placed and as they were before, in standard deviations."""
-    squared = (placed.pixels_at(result.state) - before.pixels_at(result.state)).square().sum(-2)
-    squared = before.by_frame(squared) / result.sigma_px[:, None, None].square().to(squared)
-    return float(squared[before.by_frame(result.inliers)].mean().sqrt())
+    """Distance that most keypoints moved since they were placed before, in standard deviations of their noise."""
+    moved = (placed.pixels_at(result.state) - before.pixels_at(result.state)).square().sum(-2).sqrt()
+    sigmas = (before.by_frame(moved) / result.sigma_px[:, None, None])[before.by_frame(result.inliers)]
+    return float(sigmas.kthvalue(max(1, int(_MOVED_SHARE * len(sigmas)))).values)

@@ -103,11 +103,11 @@ def _synchronised(adjuster: Adjuster, settings: Config) -> tuple[Adjustment, Clo
     if doubted:
         clocks = adjuster.search()
         if adjusted is None or bool((clocks.offsets_frames.abs() >= _SEARCHED_FRAMES).any()):
-            moved = adjuster.begin(lenses, clocks.offsets_frames)
+            moved = adjuster.begin(refined, clocks.offsets_frames)
             if adjusted is None or moved.median_residual < adjusted.median_residual:
-                adjusted = moved
+                return moved, clocks
     assert adjusted is not None
-    return adjuster.again(adjusted, refined) if set(refined) != set(lenses) else adjusted, clocks
+    return adjuster.again(adjusted, refined) if refined != lenses else adjusted, clocks
 
 
 def _chosen(adjuster: Adjuster, settings: Config, adjusted: Adjustment) -> Adjustment:
