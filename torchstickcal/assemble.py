@@ -77,7 +77,7 @@ def assemble(
         late=as_given(timing.late),
         late_std=as_given(timing.late_std),
         frame_index=frames.index,
-        times=frames.times_s,
+        times=timing.times,
         image_size=None if size is None else size.expand(count, 2).round().long().contiguous(),
         fisheye=observations.fisheye,
         sticks=observations.sticks,
@@ -130,19 +130,27 @@ class _Timing:
     """What is known of the cameras' clocks and shutters in the end, (C,) each, seconds; NaN without a frame rate."""
 
     def __init__(self, observations: Observations, reached: Adjustment, check: CameraCheck, stds: Mapping[str, Tensor]) -> None:
-        self._observations, self._refined = observations, reached.refined
+        self._observations, self._refined, self._frames = observations, reached.refined, reached.frames
         frames, unknowns, values = reached.frames, reached.measurements.unknowns, reached.result.state.unknowns
         self._period_s = 1 / frames.rate_hz if frames.rate_hz is not None else torch.nan
         nothing = torch.zeros_like(frames.offsets_frames)
         own = {} if unknowns is None or values is None else _by_kind(unknowns, values)
-        given_s = observations.readout_s or 0.0
-        self.offsets = self._seconds(frames.offsets_frames + own.get("time_offset", nothing))
+        self.readout = (observations.readout_s or 0.0) + self._seconds(own.get("readout", nothing))
+        middle = self._seconds(frames.offsets_frames + own.get("time_offset", nothing))
+        self.offsets = middle - (self.readout - self.readout[0]) / 2
         self.offsets_std = self._seconds(stds.get("time_offset", nothing))
-        self.readout = given_s + self._seconds(own.get("readout", nothing))
         self.readout_std = self._seconds(stds.get("readout", nothing))
         data = check.clocks()
         self._late_frames = data.late_frames
         self.late, self.late_std = self._seconds(data.late_frames), self._seconds(data.std)
+
+    @property
+    def times(self) -> Tensor | None:
+        """(G,), when the common frames are."""
+        if self._frames.rate_hz is None:
+            return None
+        common = self._frames.first + torch.arange(self._frames.lags.shape[1]).to(self.readout)
+        return common / self._frames.rate_hz + self.readout[0] / 2
 
     def warnings(self) -> list[str]:
         """Clocks that were taken as told and are contradicted."""

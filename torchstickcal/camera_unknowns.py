@@ -31,7 +31,7 @@ class ImageMotion(NamedTuple):
     velocity: Tensor
     """(B, C, 2, N), pixels a frame"""
     row: Tensor
-    """(B, C, N), the keypoint's row as a share of the image's height"""
+    """(B, C, N), how far below the middle row the keypoint is, as a share of the image's height"""
     reckoned: Tensor
     """(B, K), values of the unknowns at which the keypoints were placed"""
 
@@ -78,7 +78,7 @@ class ClockKind(Kind):
 
     @abstractmethod
     def factor(self, row: Tensor) -> Tensor:
-        """The delay for a value of 1 of keypoints (..., C, N) whose rows are these shares of the image's height, frames."""
+        """The delay of keypoints in rows (..., C, N), of :class:`ImageMotion`, for a value of 1, frames."""
 
     def prior(self, cameras: Intrinsics) -> Tensor:
         return torch.full_like(cameras.focal_px, self.prior_frames)
@@ -156,7 +156,7 @@ class Radial(Kind):
 
 
 class TimeOffset(ClockKind):
-    """How much later than reckoned with a camera's frames are, frames."""
+    """How much later than reckoned with a camera's frames are exposed in their middle row, frames."""
 
     name = "time_offset"
     prior_frames = 0.5
@@ -262,7 +262,7 @@ class CameraUnknowns:
         """How much later than reckoned with keypoints (B, C, N) were exposed at values (B, K), frames.
 
         Args:
-            row: their rows as shares of the image's height, (B, C, N).
+            row: of :class:`ImageMotion`, (B, C, N).
             values: of the unknowns.
         """
         delays = torch.zeros_like(row)

@@ -104,7 +104,8 @@ class Calibration:
     frame_index: Tensor
     """(C, F), the common frame (of G) that a camera's frame was nearest to, -1 where it was left out"""
     times: Tensor | None
-    """(G,), float64, when the common frames are on the first camera's clock, seconds; None without a frame rate"""
+    """(G,), float64, when the common frames are, seconds after the first camera's time 0 by its clock: when its middle row was
+    exposed; None without a frame rate"""
     image_size: Tensor | None
     """(C, 2), width and height, pixels"""
     fisheye: bool

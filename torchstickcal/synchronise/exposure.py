@@ -25,7 +25,7 @@ class Exposures:
 
     Args:
         delays: (C, N), frames after the common frame that they stand at, as far as that was told.
-        rows: (C, N), their rows as shares of the image's height; zero where that is not known.
+        rows: (C, N), how far below the middle row they are, as shares of the image's height; zero where that is not known.
     """
 
     delays: Tensor
@@ -39,7 +39,8 @@ class Exposures:
         rows = torch.zeros(observations.keypoints.shape[:3], dtype=torch.float64, device=observations.keypoints.device)
         if size is not None:
             height = size.expand(observations.num_cameras, 2)[:, 1].double()
-            rows = (observations.keypoints[..., 1].double() / height[:, None, None]).nan_to_num().clamp(0.0, 1.0)
+            rows = observations.keypoints[..., 1].double() / height[:, None, None] - 0.5
+            rows = rows.nan_to_num().clamp(-0.5, 0.5)
         delays = frames.lags[..., None].expand(-1, -1, points)
         if observations.readout_s is not None and frames.rate_hz is not None:
             delays = delays + observations.readout_s * frames.rate_hz * rows

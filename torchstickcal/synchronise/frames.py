@@ -15,7 +15,7 @@ from torchstickcal.observations import Observations
 class CommonFrames:
     """A session whose cameras' frames stand beside each other: frame g of all cameras was exposed at about the same time.
 
-    Common frame 0 of camera 0's clock is its time 0. G frames are kept: from the first that two cameras have to the last.
+    Common frames are those of camera 0's clock, from its time 0 on. G frames are kept: from the first that two cameras have to the last.
     """
 
     observations: Observations
@@ -31,13 +31,6 @@ class CommonFrames:
     rate_hz: float | None
     """common frames per second; None where that is not known"""
 
-    @property
-    def times_s(self) -> Tensor | None:
-        """(G,), float64, when the common frames are on camera 0's clock, seconds; None where the rate is not known."""
-        if self.rate_hz is None:
-            return None
-        return (self.first + torch.arange(self.lags.shape[1], dtype=torch.float64)) / self.rate_hz
-
     def to_own(self, values: Tensor, fill: float) -> Tensor:
         """Values (C, G, ...) of the common frames at the cameras' own frames, (C, F, ...)."""
         cameras = torch.arange(len(self.index), device=self.index.device)[:, None]
@@ -46,7 +39,7 @@ class CommonFrames:
 
 
 def on_common_frames(observations: Observations, offsets_frames: Tensor | None = None) -> CommonFrames:
-    """A session on common frames: every camera's frame at the common frame nearest to the middle of its exposure.
+    """A session on common frames, every camera's frame at the nearest one.
 
     Args:
         observations: the session.
@@ -58,9 +51,8 @@ def on_common_frames(observations: Observations, offsets_frames: Tensor | None =
     rate, begins = _begins(observations)
     offsets = begins.new_zeros(len(begins)) if offsets_frames is None else offsets_frames.to(begins)
     begins = begins + offsets[:, None]
-    shutter = observations.readout_s * rate / 2 if observations.readout_s is not None and rate is not None else 0.0
     exists = begins.isfinite()
-    common = (begins.nan_to_num() + shutter + 0.5).floor().long()
+    common = (begins.nan_to_num() + 0.5).floor().long()
     starts = torch.where(exists, common, torch.iinfo(torch.long).max).amin(1).sort().values
     ends = torch.where(exists, common, torch.iinfo(torch.long).min).amax(1).sort().values
     first, last = int(starts[1]), int(ends[-2])
