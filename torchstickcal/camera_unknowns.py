@@ -244,6 +244,12 @@ class CameraUnknowns:
         """Every camera's own values (B, C, k), of the rig's (B, K)."""
         return torch.einsum("ckj,bj->bck", self.share, values)
 
+    def unshared(self) -> CameraUnknowns:
+        """The same where every camera has a value of its own of every kind: K = C k, :meth:`by_camera` flattened."""
+        cameras, kinds, _ = self.share.shape
+        share = torch.eye(cameras * kinds).to(self.share).unflatten(0, (cameras, kinds))
+        return CameraUnknowns(self.kinds, share, self.by_camera(self.prior_sigma).flatten(1))
+
     def applied(self, cameras: Intrinsics, values: Tensor) -> Intrinsics:
         """The cameras at values (B, K)."""
         for kind, own in zip(self.kinds, self.by_camera(values).unbind(-1), strict=True):
@@ -272,3 +278,11 @@ class CameraUnknowns:
         found = [kind.column(sight) for kind in self.kinds]
         x, y = (torch.stack([axis.expand_as(sight.u) for axis in axes], dim=-2) for axes in zip(*found, strict=True))
         return x, y
+
+    def moved(
+        self, u: Tensor, v: Tensor, pixel: PixelMap, cameras: Intrinsics, motion: ImageMotion | None, step: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        """How projections (x, y), each (B, C, N), move with a step (B, K); the rest as of :meth:`columns`."""
+        own = self.by_camera(step)[..., None]
+        x, y = self.columns(u, v, pixel, cameras, motion)
+        return (own * x).sum(-2), (own * y).sum(-2)
