@@ -231,7 +231,7 @@ class CameraUnknowns:
             priors.append(kinds[kind].prior(cameras)[..., sharing].mean(-1))
         return CameraUnknowns(tuple(kinds), share, torch.stack(priors, dim=-1))
 
-    def __getitem__(self, sessions: slice) -> CameraUnknowns:
+    def __getitem__(self, sessions: slice | list[int]) -> CameraUnknowns:
         """Those of some of the sessions."""
         return replace(self, prior_sigma=self.prior_sigma[sessions])
 
