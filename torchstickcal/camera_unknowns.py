@@ -16,6 +16,7 @@ import torch
 from torch import Tensor
 
 from torchstickcal.cameras import Intrinsics, PixelMap
+from torchstickcal.errors import ConfigError
 
 Columns = slice | Tensor
 """Some of the columns N: a slice of whole frames, or indices."""
@@ -213,9 +214,19 @@ class CameraUnknowns:
             names: which.
             cameras: as given, (B, C).
             groups: a label for each camera; those with the same share what is shared, None if all do.
+
+        Raises:
+            ConfigError: if there are groups, but not a label for each camera.
         """
         count = cameras.focal_px.shape[-1]
         labels = list(groups) if groups else [None] * count
+        if len(labels) != count:
+            raise ConfigError(
+                "camera groups do not fit the cameras",
+                where="camera_groups",
+                got=f"{len(labels)} labels",
+                expected=f"{count}, one for each camera",
+            )
         members = [[c for c in range(count) if labels[c] == label] for label in dict.fromkeys(labels)]
         kinds: list[Kind] = []
         columns: list[tuple[int, list[int]]] = []

@@ -18,7 +18,7 @@ from torchstickcal.gradients import GradientMode, attach, gradient_mode
 from torchstickcal.initialise import initialise, triangulated
 from torchstickcal.objective import Objective
 from torchstickcal.observations import Observations, Stick
-from torchstickcal.pipeline import points_used, unknowns_of
+from torchstickcal.pipeline import points_used
 from torchstickcal.problem import Measurements, State
 from torchstickcal.solvers import unheard
 from torchstickcal.solvers.newton import polish
@@ -112,7 +112,8 @@ class CalibrationLayer(nn.Module):
         """
         batched = keypoints.ndim == 5
         given = _Given.of(keypoints if batched else keypoints[None], intrinsics, stick_lengths, confidence, self.sticks)
-        given = replace(given, unknowns=unknowns_of(given.cameras, self._refined, self.config))
+        if self._refined:
+            given = replace(given, unknowns=CameraUnknowns.of(self._refined, given.cameras, self.config.camera_groups))
         if initial is not None and not batched:
             initial = _each(initial, lambda tensor: tensor[None])
         if initial is not None and initial.unknowns.shape != given.nothing_found.shape:

@@ -13,7 +13,6 @@ from torch import Tensor
 
 from torchstickcal.assemble import assemble
 from torchstickcal.camera_unknowns import CameraUnknowns
-from torchstickcal.cameras import Intrinsics
 from torchstickcal.config import Config, Refine, Stage, StickLengthSettings, load_config, with_refine
 from torchstickcal.errors import ConfigError
 from torchstickcal.focal_search import search_focal
@@ -137,26 +136,17 @@ def refining(measurements: Measurements, names: Sequence[str], settings: Config)
     """Measurements with some of :data:`torchstickcal.camera_unknowns.REFINEMENTS` among the unknowns.
 
     Raises:
-        ConfigError: as :func:`unknowns_of`.
-    """
-    return replace(measurements, unknowns=unknowns_of(measurements.cameras, names, settings))
-
-
-def unknowns_of(cameras: Intrinsics, names: Sequence[str], settings: Config) -> CameraUnknowns | None:
-    """Some of :data:`torchstickcal.camera_unknowns.REFINEMENTS` as unknowns of cameras (B, C); None for no names.
-
-    Raises:
         ConfigError: if there are camera groups, but not a label for each camera.
     """
-    groups, count = settings.camera_groups, cameras.focal_px.shape[-1]
-    if groups and len(groups) != count:
+    groups = settings.camera_groups
+    if groups and len(groups) != measurements.num_cameras:
         raise ConfigError(
             "camera groups do not fit the cameras",
             where="camera_groups",
             got=f"{len(groups)} labels",
-            expected=f"{count}, one for each camera",
+            expected=f"{measurements.num_cameras}, one for each camera",
         )
-    return CameraUnknowns.of(names, cameras, groups) if names else None
+    return replace(measurements, unknowns=CameraUnknowns.of(names, measurements.cameras, groups) if names else None)
 
 
 def _split(stages: Mapping[str, Stage]) -> tuple[dict[str, Stage], dict[str, Stage]]:
