@@ -23,6 +23,9 @@ UnknownColumns = Callable[[Tensor, Tensor, PixelMap], tuple[Tensor, Tensor]]
 """Derivatives of projections (x, y), each (..., C, k, N), by what is unknown of the cameras beside their poses, of normalised
 coordinates (..., C, N) and the pixels there."""
 
+ImageStep = Callable[[Tensor, Tensor, PixelMap], tuple[Tensor, Tensor]]
+"""How projections (x, y) move, each (..., C, N), where the points stay, of the same."""
+
 
 class Loss(nn.Module):
     """A sum of robust squared residuals in units of their standard deviation.
@@ -149,15 +152,24 @@ class CameraPointLoss(Loss, ABC):
         """
 
     @abstractmethod
-    def slope(self, points_cam: Tensor, moved_cam: Tensor, pixels: Tensor, information: Tensor, cameras: Intrinsics) -> Tensor:
-        """Half the derivative of the loss where the points move, summed: differentiable by all that is given.
+    def slope(
+        self,
+        points_cam: Tensor,
+        moved_cam: Tensor,
+        pixels: Tensor,
+        information: Tensor,
+        cameras: Intrinsics,
+        image_step: ImageStep | None = None,
+    ) -> Tensor:
+        """Half the derivative of the loss where points and cameras move, summed: differentiable by all that is given.
 
         Args:
             points_cam: the points in every camera's frame, (..., C, 3, N).
             moved_cam: how they move, (..., C, 3, N).
             pixels: (..., C, 2, N).
-            information: confidence / sigma^2, (..., C, N).
+            information: confidence / sigma^2, (..., C, N), zero where not seen.
             cameras: the C cameras.
+            image_step: what changes of the cameras beside their poses.
         """
 
 

@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from torchstickcal.cameras import Intrinsics, PixelMap, inverse_depths
-from torchstickcal.losses.base import CameraPointLoss, CameraPointTerms, UnknownColumns, UnknownTerms
+from torchstickcal.losses.base import CameraPointLoss, CameraPointTerms, ImageStep, UnknownColumns, UnknownTerms
 from torchstickcal.symmetric import symmetric_product
 
 
@@ -116,16 +116,28 @@ class ReprojectionLoss(CameraPointLoss):
             else _by_unknowns(by_unknowns(u, v, m), weights, rx, ry, m, p, q, inverse_depth),
         )
 
-    def slope(self, points_cam: Tensor, moved_cam: Tensor, pixels: Tensor, information: Tensor, cameras: Intrinsics) -> Tensor:
+    def slope(
+        self,
+        points_cam: Tensor,
+        moved_cam: Tensor,
+        pixels: Tensor,
+        information: Tensor,
+        cameras: Intrinsics,
+        image_step: ImageStep | None = None,
+    ) -> Tensor:
         x, y, z = points_cam.unbind(-2)
         dx, dy, dz = moved_cam.unbind(-2)
-        inverse_depth = inverse_depths(z)
+        inverse_depth = inverse_depths(z.where(information > 0, 1.0))
         u, v = x * inverse_depth, y * inverse_depth
         du, dv = (dx - u * dz) * inverse_depth, (dy - v * dz) * inverse_depth
         m = cameras.pixels_with_jacobian(u, v)
+        moved_x, moved_y = m.dx_du * du + m.dx_dv * dv, m.dy_du * du + m.dy_dv * dv
+        if image_step is not None:
+            own_x, own_y = image_step(u, v, m)
+            moved_x, moved_y = moved_x + own_x, moved_y + own_y
         rx, ry = m.x - pixels[..., 0, :], m.y - pixels[..., 1, :]
         weights = self.weight * information * self.kernel.weight((rx.square() + ry.square()) * information)
-        return (weights * (rx * (m.dx_du * du + m.dx_dv * dv) + ry * (m.dy_du * du + m.dy_dv * dv))).sum()
+        return (weights * (rx * moved_x + ry * moved_y)).sum()
 
 
 def _by_unknowns(

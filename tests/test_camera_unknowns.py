@@ -1,4 +1,4 @@
-"""Unknown lenses and clocks in the reduced system, against a dense solve built by autograd."""
+"""Unknown lenses and clocks in the reduced system and in the objective's slope, against dense systems built by autograd."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from torch import Tensor
 
 from torchstickcal.camera_unknowns import REFINEMENTS, CameraUnknowns, ImageMotion
 from torchstickcal.cameras import Intrinsics
-from torchstickcal.losses import Cauchy, Loss, ReprojectionLoss, SmoothnessLoss, StickLengthLoss
+from torchstickcal.losses import Cauchy, GemanMcClure, Loss, ReprojectionLoss, SmoothnessLoss, StickLengthLoss
 from torchstickcal.losses.reprojection import reprojection_residuals
 from torchstickcal.objective import Objective
 from torchstickcal.problem import Measurements, State
@@ -28,10 +28,12 @@ LENSES = {
 }
 
 
-def unknown_rig(measurements: Measurements, state: State, names: tuple[str, ...], lens: str) -> tuple[Measurements, State]:
+def unknown_rig(
+    measurements: Measurements, state: State, names: tuple[str, ...], lens: str, frames: int = 5
+) -> tuple[Measurements, State]:
     """The first frames of a session with unknowns at values that are not zero, and invented motion in the image."""
     generator = torch.Generator().manual_seed(len(names))
-    columns = slice(0, 5 * measurements.points_per_frame)
+    columns = slice(0, frames * measurements.points_per_frame)
     shape = measurements.confidence[..., columns].shape
     velocity = 30 * torch.randn(*shape[:2], 2, shape[2], generator=generator, dtype=torch.float64)
     row = torch.rand(shape, generator=generator, dtype=torch.float64)
@@ -42,7 +44,7 @@ def unknown_rig(measurements: Measurements, state: State, names: tuple[str, ...]
         measurements,
         pixels=measurements.pixels[..., columns].contiguous(),
         confidence=measurements.confidence[..., columns].contiguous(),
-        frames=5,
+        frames=frames,
         cameras=cameras,
         unknowns=CameraUnknowns.of(names, cameras, groups=[0, 0, 1, 1]),
     )
@@ -105,3 +107,47 @@ def test_step_is_that_of_the_full_system(disturbed: tuple[Measurements, State], 
     assert float(step.predicted_decrease) == pytest.approx(predicted, rel=1e-8)
     terms = objective.terms(state.rotations, state.translations, at[2][None], state.unknowns)
     assert float(system.cost) == pytest.approx(float(sum(terms.values())), rel=1e-12)
+
+
+@pytest.mark.parametrize("lens", LENSES)
+@pytest.mark.parametrize("names", CHOICES, ids="-".join)
+def test_exact_hessian_and_slope_are_autograds(disturbed: tuple[Measurements, State], names: tuple[str, ...], lens: str):
+    """At a state that is no minimum: all terms of the second derivative take part."""
+    m, state = unknown_rig(*disturbed, names, lens, frames=2)
+    assert m.unknowns is not None
+    assert state.unknowns is not None
+    losses: dict[str, Loss] = {"reprojection": ReprojectionLoss(9.0, 0.7, GemanMcClure(8.0)), "length": StickLengthLoss(0.1)}
+    objective, count = Objective(m, losses), m.unknowns.count
+    sizes = [18, count, state.points.numel()]
+
+    def split(vector: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        cameras, unknowns, points = vector.split(sizes)
+        return cameras.view(1, 3, 6), unknowns[None], points.view(1, -1, 3).mT
+
+    def value(vector: Tensor, at: Tensor = state.unknowns) -> Tensor:
+        cameras, unknowns, points = split(vector)
+        step = Se3.exp(cameras[0]).matrix()
+        turned = torch.cat([state.rotations[:, :1], state.rotations[:, 1:] @ step[None, :, :3, :3]], dim=1)
+        moved = (state.rotations[:, 1:] @ step[None, :, :3, 3:])[..., 0] + state.translations[:, 1:]
+        translations = torch.cat([state.translations[:, :1], moved], dim=1)
+        points = m.by_frame(state.points + points).movedim(1, -1)
+        terms = objective.terms(turned, translations, points, at + unknowns)
+        return torch.stack(list(terms.values())).sum() / 2
+
+    zero = torch.zeros(sum(sizes), dtype=torch.float64)
+    hessian = torch.autograd.functional.hessian(value, zero, vectorize=True)
+    inactive = (~m.active[0]).repeat_interleave(3).nonzero().flatten() + 18 + count
+    hessian[inactive, inactive] += 1.0
+    damping = 1.0  # makes it definite away from the minimum
+    damped = hessian + damping * torch.diag(hessian.diagonal())
+    rhs, direction = torch.randn(2, len(zero), generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+
+    *found, solved = NormalEquations(objective, state, True, damping, exact=True).solve(*split(rhs))
+    assert bool(solved)
+    together = torch.cat([found[0].flatten(), found[1].flatten(), found[2].mT.flatten()])
+    torch.testing.assert_close(damped @ together, rhs, rtol=1e-8, atol=1e-8)
+
+    cameras, unknowns, points = split(direction)
+    slope = objective.slope(state, torch.nn.functional.pad(cameras, (0, 0, 1, 0)), points, unknowns)
+    (gradient,) = torch.autograd.grad(value(zero.requires_grad_()), zero)
+    assert float(slope) == pytest.approx(float(gradient @ direction), rel=1e-10)

@@ -130,9 +130,11 @@ def test_unknown_refinement_is_refused():
     assert with_refinements(("focal_shared",), ("focal", "radial")) == ("focal", "radial")
 
 
-def test_layer_refuses_to_refine():
-    with pytest.raises(ConfigError, match="takes lenses as given"):
-        CalibrationLayer(session().observations.sticks, {"extends": "default", "refine": ["focal"]})
+def test_layer_finds_what_calibrate_finds():
+    seen = session(focal_scale=1.03).observations
+    config = {"extends": "default", "refine": ["focal"]}
+    layer, found = CalibrationLayer(seen.sticks, config), calibrate(seen, config)
+    torch.testing.assert_close(layer(seen.keypoints, seen.cameras).intrinsics, found.intrinsics, rtol=1e-4, atol=0)
 
 
 def test_saved_and_loaded(tmp_path):

@@ -12,7 +12,7 @@ from torch import Tensor
 from torchstickcal.camera_check import CameraCheck, with_refinements
 from torchstickcal.camera_unknowns import CLOCKS, REFINEMENTS, CameraUnknowns
 from torchstickcal.config import Config, Stage, StickLengthSettings
-from torchstickcal.errors import ConfigError, ObservationError
+from torchstickcal.errors import ObservationError
 from torchstickcal.focal_search import search_focal
 from torchstickcal.initialise import initialise
 from torchstickcal.observations import Observations
@@ -194,14 +194,6 @@ class Adjuster:
             ConfigError: if there are camera groups, but not a label for each camera.
             ObservationError: if clocks are asked for without what they are counted in.
         """
-        groups = self._settings.camera_groups
-        if groups and len(groups) != seen.num_cameras:
-            raise ConfigError(
-                "camera groups do not fit the cameras",
-                where="camera_groups",
-                got=f"{len(groups)} labels",
-                expected=f"{seen.num_cameras}, one for each camera",
-            )
         impossible = set(names) - self.refinable
         if impossible:
             raise ObservationError(
@@ -210,7 +202,7 @@ class Adjuster:
                 got=", ".join(sorted(impossible)),
                 expected="fps or timestamps, and for readout the image size",
             )
-        return replace(seen, unknowns=CameraUnknowns.of(names, seen.cameras, groups) if names else None)
+        return replace(seen, unknowns=CameraUnknowns.of(names, seen.cameras, self._settings.camera_groups) if names else None)
 
 
 def points_used(observations: Observations, config: Config) -> list[int] | None:

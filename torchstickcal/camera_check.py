@@ -15,6 +15,7 @@ import torch
 from torch import Tensor
 
 from torchstickcal.camera_unknowns import REFINEMENTS, CameraUnknowns
+from torchstickcal.noise import residual_correlation
 from torchstickcal.problem import Measurements, State
 from torchstickcal.solvers.normal_equations import NormalEquations
 from torchstickcal.uncertainty import normal_objective
@@ -36,6 +37,7 @@ _CHOICES = (
     ("focal", "principal_point", "radial"),
 )
 _SIGMAS = 4.0
+_LEAST_EVIDENCE = 1e-6
 _PRICE = 4.0
 """What a further parameter has to lower the cost by, a standard deviation's being 1: chance gives 1 each."""
 
@@ -86,6 +88,8 @@ class CameraCheck:
         objective = normal_objective(looked_at, sigma_px, sigma_length_m)
         system = NormalEquations(objective, replace(state, unknowns=None), cameras_free=True)
         self._information, self._gradient = system.reduced[0], system.reduced_gradient[0]
+        correlation = residual_correlation(measurements, state)
+        self._evidence = (1 - correlation) / (1 + correlation)
 
     def focal(self) -> FocalCheck:
         """The focal lengths, each camera's on its own."""
@@ -118,8 +122,12 @@ class CameraCheck:
         return choice
 
     def gain(self, names: tuple[str, ...]) -> float:
-        """Decrease of the cost that a choice promises, less a price for each of its parameters."""
-        return self._decrease(names) - self._decrease(()) - _PRICE * CameraUnknowns.of(names, self._cameras).count
+        """Decrease of the cost that a choice promises, less a price for each of its parameters.
+
+        Residuals that are alike from frame to frame count as the fewer independent ones that they are worth.
+        """
+        promised = self._evidence * (self._decrease(names) - self._decrease(()))
+        return promised - _PRICE * CameraUnknowns.of(names, self._cameras).count
 
     def _decrease(self, names: tuple[str, ...]) -> float:
         chosen = self._chosen(names)
@@ -131,7 +139,8 @@ class CameraCheck:
         chosen = self._chosen(names)
         covariance = torch.linalg.inv(chosen.mT @ self._information @ chosen)
         cameras = len(self._gradient) - self._every.count
-        return -(covariance @ (chosen.mT @ self._gradient))[cameras:], covariance[cameras:, cameras:]
+        values = -(covariance @ (chosen.mT @ self._gradient))[cameras:]
+        return values, covariance[cameras:, cameras:] / max(self._evidence, _LEAST_EVIDENCE)
 
     def _chosen(self, names: tuple[str, ...]) -> Tensor:
         """The map from poses and a choice's parameters to poses and all parameters."""

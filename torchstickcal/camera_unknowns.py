@@ -16,6 +16,7 @@ import torch
 from torch import Tensor
 
 from torchstickcal.cameras import Intrinsics, PixelMap
+from torchstickcal.errors import ConfigError
 
 Columns = slice | Tensor
 """Some of the columns N: a slice of whole frames, or indices."""
@@ -221,9 +222,19 @@ class CameraUnknowns:
             names: which.
             cameras: as given, (B, C).
             groups: a label for each camera; those with the same share what is shared, None if all do.
+
+        Raises:
+            ConfigError: if there are groups, but not a label for each camera.
         """
         count = cameras.focal_px.shape[-1]
         labels = list(groups) if groups else [None] * count
+        if len(labels) != count:
+            raise ConfigError(
+                "camera groups do not fit the cameras",
+                where="camera_groups",
+                got=f"{len(labels)} labels",
+                expected=f"{count}, one for each camera",
+            )
         members = [[c for c in range(count) if labels[c] == label] for label in dict.fromkeys(labels)]
         kinds: list[Kind] = []
         columns: list[tuple[int, list[int]]] = []
@@ -239,7 +250,7 @@ class CameraUnknowns:
             priors.append(kinds[kind].prior(cameras)[..., sharing].mean(-1))
         return CameraUnknowns(tuple(kinds), share, torch.stack(priors, dim=-1))
 
-    def __getitem__(self, sessions: slice) -> CameraUnknowns:
+    def __getitem__(self, sessions: slice | list[int]) -> CameraUnknowns:
         """Those of some of the sessions."""
         return replace(self, prior_sigma=self.prior_sigma[sessions])
 
@@ -251,6 +262,12 @@ class CameraUnknowns:
     def by_camera(self, values: Tensor) -> Tensor:
         """Every camera's own values (B, C, k), of the rig's (B, K)."""
         return torch.einsum("ckj,bj->bck", self.share, values)
+
+    def unshared(self) -> CameraUnknowns:
+        """The same where every camera has a value of its own of every kind: K = C k, :meth:`by_camera` flattened."""
+        cameras, kinds, _ = self.share.shape
+        share = torch.eye(cameras * kinds).to(self.share).unflatten(0, (cameras, kinds))
+        return CameraUnknowns(self.kinds, share, self.by_camera(self.prior_sigma).flatten(1))
 
     def applied(self, cameras: Intrinsics, values: Tensor) -> Intrinsics:
         """The cameras at values (B, K)."""
@@ -292,3 +309,11 @@ class CameraUnknowns:
         found = [kind.column(sight) for kind in self.kinds]
         x, y = (torch.stack([axis.expand_as(sight.u) for axis in axes], dim=-2) for axes in zip(*found, strict=True))
         return x, y
+
+    def moved(
+        self, u: Tensor, v: Tensor, pixel: PixelMap, cameras: Intrinsics, motion: ImageMotion | None, step: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        """How projections (x, y), each (B, C, N), move with a step (B, K); the rest as of :meth:`columns`."""
+        own = self.by_camera(step)[..., None]
+        x, y = self.columns(u, v, pixel, cameras, motion)
+        return (own * x).sum(-2), (own * y).sum(-2)

@@ -115,8 +115,8 @@ class Intrinsics:
         fx, skew, _, fy, _ = self._pixel_map(u.ndim)
         r2 = u * u + v * v
         if self.fisheye:
-            theta = r2.sqrt().atan()
-            growth = theta ** (2 * order) * theta / r2.clamp_min(1e-16).sqrt()
+            r = r2.clamp_min(1e-16).sqrt()
+            growth = r.atan() ** (2 * order + 1) / r
         else:
             growth = r2**order
             if self._has_denominator:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -11,6 +11,7 @@ import torch
 from torch import Tensor, nn
 
 from torchstickcal.adjust import points_used
+from torchstickcal.camera_unknowns import CLOCKS, CameraUnknowns
 from torchstickcal.cameras import Intrinsics
 from torchstickcal.config import Config, Stage, load_config
 from torchstickcal.errors import CalibrationError, ConfigError, ObservationError
@@ -32,13 +33,19 @@ _KEYPOINTS_AT_ONCE = 32_000
 class LayerResult:
     """Calibrated rigs, in the frame of each session's first camera; leading B only where the keypoints had it.
 
-    ``rotations``, ``translations`` and ``points`` carry gradients, and have the dtype and device of the keypoints.
+    Poses, lenses and points carry gradients, and have the dtype and device of the keypoints.
     """
 
     rotations: Tensor
     """(B, C, 3, 3), world to camera; the identity where a session could not be calibrated"""
     translations: Tensor
     """(B, C, 3), metres; zero where a session could not be calibrated"""
+    intrinsics: Tensor
+    """(B, C, 3, 3), pixels, with what the configuration refines as found; as given where a session could not be calibrated"""
+    distortion: Tensor | None
+    """(B, C, D), likewise; None for perfect lenses"""
+    unknowns: Tensor
+    """(B, K), how the lenses differ from those given, as :class:`torchstickcal.camera_unknowns.CameraUnknowns` has it"""
     points: Tensor
     """(B, F, P, 3), metres; zero where ``known`` is False"""
     known: Tensor
@@ -56,7 +63,8 @@ class LayerResult:
 class CalibrationLayer(nn.Module):
     """From keypoints to cameras and points in metres, with gradients back to keypoints, confidence, intrinsics and lengths.
 
-    The noise of the keypoints and the choice of outliers, where the configuration estimates them, count as constants.
+    Where the configuration refines lenses, those given are where they are found from. The noise of the keypoints and the choice
+    of outliers, where the configuration estimates them, count as constants.
 
     Args:
         sticks: the stick or sticks, as of :class:`Observations`.
@@ -64,7 +72,7 @@ class CalibrationLayer(nn.Module):
         gradient: ``implicit`` (exact), ``gauss_newton`` (approximate), ``unrolled``, or a :class:`GradientMode`.
 
     Raises:
-        ConfigError: for an unusable configuration, or one that refines lenses.
+        ConfigError: for an unusable configuration, or one that refines clocks or chooses what to refine.
     """
 
     def __init__(
@@ -76,14 +84,7 @@ class CalibrationLayer(nn.Module):
         super().__init__()
         self.sticks = (sticks,) if isinstance(sticks, Stick) else tuple(sticks)
         self.config = load_config(config)
-        if self.config.refine:
-            raise ConfigError(
-                "the layer takes lenses as given",
-                where="config.refine",
-                got=self.config.refine,
-                expected="nothing",
-                remedy="Calibrate once with refine, and give the layer the lenses found.",
-            )
+        self._refined = _lenses(self.config)
         self.gradient = gradient_mode(gradient)
 
     def forward(
@@ -101,28 +102,40 @@ class CalibrationLayer(nn.Module):
             intrinsics: camera matrices (3, 3), (C, 3, 3) or (B, C, 3, 3), or :class:`Intrinsics` with their lenses.
             stick_lengths: (S,) or (B, S), metres, instead of the lengths of ``sticks``.
             confidence: (B, C, F, P) or (C, F, P), in [0, 1].
-            initial: an earlier result to start from, if the keypoints have moved but little since. It saves the
+            initial: an earlier result of this layer to start from, if the keypoints have moved but little since. It saves the
                 initialisation and all stages before the last one that adjusts the cameras.
 
         Raises:
+            ConfigError: if the configuration's camera groups do not fit the cameras.
             ObservationError: for arguments whose shapes do not fit. A session that cannot be calibrated from is not an error
                 but a status.
         """
         batched = keypoints.ndim == 5
         given = _Given.of(keypoints if batched else keypoints[None], intrinsics, stick_lengths, confidence, self.sticks)
+        if self._refined:
+            given = replace(given, unknowns=CameraUnknowns.of(self._refined, given.cameras, self.config.camera_groups))
+        if initial is not None and not batched:
+            initial = _each(initial, lambda tensor: tensor[None])
+        if initial is not None and initial.unknowns.shape != given.nothing_found.shape:
+            raise ObservationError(
+                "the earlier result is of other sessions, or of another choice of what to refine",
+                where="initial.unknowns",
+                got=tuple(initial.unknowns.shape),
+                expected=str(tuple(given.nothing_found.shape)),
+            )
         with torch.autocast(keypoints.device.type, enabled=False):
-            result = self._calibrated(given, initial if batched or initial is None else _with_batch(initial))
-        return result if batched else _without_batch(result)
+            result = self._calibrated(given, initial)
+        return result if batched else _each(result, lambda tensor: tensor[0])
 
     def _calibrated(self, given: _Given, initial: LayerResult | None) -> LayerResult:
         """All sessions; those that can be begun are solved side by side."""
         shape = given.keypoints.shape[:-1]
-        found = [_failed(shape[1:], given.keypoints) for _ in range(shape[0])]
         device = given.keypoints.device
+        found: dict[int, _Solved] = {}
 
         def begin(index: int) -> _Begun | str:
             try:
-                return self._begin(given.observations(index, self.sticks), initial, index)
+                return self._begin(given, initial, index)
             except CalibrationError as error:
                 return f"{type(error).__name__}: {error}"
 
@@ -130,7 +143,7 @@ class CalibrationLayer(nn.Module):
         with torch.no_grad():
             for index, start in enumerate(map_on_workers(device, begin, range(shape[0]))):
                 if isinstance(start, str):
-                    found[index] = found[index]._replace(status=start)
+                    found[index] = given.failed(index, start)
                 else:
                     begun[index] = start
         together = len(begun) if device.type != "cpu" else max(1, _KEYPOINTS_AT_ONCE // shape[1:].numel())
@@ -142,28 +155,33 @@ class CalibrationLayer(nn.Module):
         for group, solved in zip(groups, map_on_workers(device, solve, groups), strict=True):
             for index, session in zip(group, solved, strict=True):
                 found[index] = session
-        tensors = (torch.stack(values) for values in list(zip(*found, strict=True))[:-1])
-        return LayerResult(*tensors, status=tuple(session.status for session in found))
+        *columns, status = zip(*(found[index] for index in range(shape[0])), strict=True)
+        tensors: list[Any] = [None if column[0] is None else torch.stack(column) for column in columns]
+        return LayerResult(*tensors, status=status)
 
-    def _begin(self, observations: Observations, initial: LayerResult | None, index: int) -> _Begun:
+    def _begin(self, given: _Given, initial: LayerResult | None, index: int) -> _Begun:
         """A session's measurements and where to start."""
+        observations = given.observations(index, self.sticks)
         measurements = Measurements.of(observations, points_used(observations, self.config))
         settings = self.config.initialise
         if initial is None or not bool(initial.converged[index]):
             labels = [observations.camera_label(camera) for camera in range(observations.num_cameras)]
-            return _Begun(observations, measurements, initialise(measurements, settings, labels))
-        rotations, translations = (v[index][None].detach().double() for v in (initial.rotations, initial.translations))
+            state = replace(initialise(measurements, settings, labels), unknowns=given.nothing_found[index][None])
+            return _Begun(observations, measurements, state)
+        rotations, translations, unknowns = (
+            v[index][None].detach().double() for v in (initial.rotations, initial.translations, initial.unknowns)
+        )
         points = initial.points[index].detach().double().flatten(0, 1).mT[None]
         known = initial.known[index].flatten()
         if bool((measurements.active[0] & ~known).any()):
             points = points.where(known, triangulated(measurements, rotations, translations, settings))
-        return _Begun(observations, measurements, State(rotations, translations, points.contiguous()))
+        return _Begun(observations, measurements, State(rotations, translations, points.contiguous(), unknowns))
 
     def _solve(self, given: _Given, begun: list[_Begun], warm: bool) -> list[_Solved]:
         """Run the stages on sessions side by side, then tie the last ones to what was given."""
         stages = list(self.config.stages.items())
         last_free = max((number for number, (_, stage) in enumerate(stages) if stage.cameras == "free"), default=0)
-        measurements = Measurements.stack([session.measurements for session in begun])
+        measurements = replace(Measurements.stack([session.measurements for session in begun]), unknowns=given.unknowns)
         state = State.stack([session.state for session in begun])
         known = rulers([session.observations for session in begun], self.config)
         reached: list[tuple[Stage, StageResult]] = []
@@ -172,7 +190,8 @@ class CalibrationLayer(nn.Module):
                 reached.append((stage, run_stage(name, stage, measurements, state, known, self.config.solver, unheard)))
                 state = reached[-1][1].state
         decisive = reached[last_free - len(stages) :]
-        tied = self._tied(given, measurements, decisive, known)
+        data = given.measurements(measurements)
+        tied = self._tied(data, decisive, known)
         last = decisive[-1][1]
         status = [
             "; ".join(f"{record.name}: {record.stop}" for record in records if not record.stop.converged) or "converged"
@@ -181,10 +200,15 @@ class CalibrationLayer(nn.Module):
         seen = measurements.by_frame(last.inliers.any(1))
         points = measurements.by_frame(tied.points).movedim(1, -1).where(seen[..., None], 0.0)
         dtype = given.keypoints.dtype
+        cameras = data.cameras_at(tied).to(dtype)
+        assert tied.unknowns is not None
         return [
             _Solved(
                 tied.rotations[k].to(dtype),
                 tied.translations[k].to(dtype),
+                cameras.matrix[k],
+                None if cameras.distortion is None else cameras.distortion[k],
+                tied.unknowns[k].to(dtype),
                 points[k].to(dtype),
                 seen[k],
                 measurements.by_frame(last.inliers[k]),
@@ -195,22 +219,15 @@ class CalibrationLayer(nn.Module):
             for k in range(len(begun))
         ]
 
-    def _tied(
-        self,
-        given: _Given,
-        measurements: Measurements,
-        decisive: Sequence[tuple[Stage, StageResult]],
-        known: Sequence[Ruler],
-    ) -> State:
-        """The result of the last stage that adjusts the cameras and of those after it, with gradients."""
-        data = given.measurements(measurements)
+    def _tied(self, data: Measurements, decisive: Sequence[tuple[Stage, StageResult]], known: Sequence[Ruler]) -> State:
+        """The result of the last stage that adjusts the cameras and of those after it, with gradients by the data."""
         rulers_given = [
             replace(ruler, lengths_m=data.lengths_m[:, number]) if ruler.rigid else ruler for number, ruler in enumerate(known)
         ]
         state: State | None = None
         for stage, result in decisive:
             kept = replace(data, confidence=data.confidence.where(result.inliers, 0.0))
-            held = (state.rotations, state.translations) if state is not None and stage.cameras == "held" else None
+            held = state if stage.cameras == "held" else None
             minimum = _polished(kept, result, held)
             state = attach(Objective(kept, result.losses), minimum, self.gradient, held)
             if stage.rescale:
@@ -232,6 +249,9 @@ class _Solved(NamedTuple):
 
     rotations: Tensor
     translations: Tensor
+    intrinsics: Tensor
+    distortion: Tensor | None
+    unknowns: Tensor
     points: Tensor
     known: Tensor
     inliers: Tensor
@@ -241,28 +261,10 @@ class _Solved(NamedTuple):
 
 
 @torch.no_grad()
-def _polished(measurements: Measurements, result: StageResult, held: tuple[Tensor, Tensor] | None) -> State:
+def _polished(measurements: Measurements, result: StageResult, held: State | None) -> State:
     """A stage's minimum, to rounding: a gradient is worth as much as the minimum that it is taken at."""
-    start = result.minimum
-    if held is not None:
-        start = replace(start, rotations=held[0].detach(), translations=held[1].detach())
+    start = result.minimum if held is None else replace(held, points=result.minimum.points)
     return polish(Objective(measurements, result.losses), start, cameras_free=held is None)
-
-
-def _failed(shape: torch.Size, like: Tensor) -> _Solved:
-    """A session of C cameras, F frames and P points that could not be calibrated."""
-    cameras, frames, points = shape
-    nothing = torch.zeros(cameras, frames, points, dtype=torch.bool, device=like.device)
-    return _Solved(
-        torch.eye(3).to(like).expand(cameras, 3, 3),
-        like.new_zeros(cameras, 3),
-        like.new_zeros(frames, points, 3),
-        nothing[0],
-        nothing,
-        like.new_zeros(points),
-        nothing[0, 0, 0],
-        "",
-    )
 
 
 @dataclass(frozen=True)
@@ -277,6 +279,8 @@ class _Given:
     """(B, C, ...), float64"""
     lengths_m: Tensor
     """(B, S), float64"""
+    unknowns: CameraUnknowns | None = None
+    """what is to be found of the lenses"""
 
     @staticmethod
     def of(
@@ -311,7 +315,35 @@ class _Given:
     def of_sessions(self, chosen: list[int]) -> _Given:
         """Some of the sessions."""
         confidence = None if self.confidence is None else self.confidence[chosen]
-        return _Given(self.keypoints[chosen], confidence, self.cameras[chosen], self.lengths_m[chosen])
+        unknowns = self.unknowns and self.unknowns[chosen]
+        return _Given(self.keypoints[chosen], confidence, self.cameras[chosen], self.lengths_m[chosen], unknowns)
+
+    @property
+    def nothing_found(self) -> Tensor:
+        """(B, K), the unknowns of lenses as given."""
+        return self.lengths_m.new_zeros(len(self.lengths_m), 0 if self.unknowns is None else self.unknowns.count)
+
+    @torch.no_grad()
+    def failed(self, index: int, status: str) -> _Solved:
+        """A session that could not be calibrated, and why."""
+        like = self.keypoints
+        cameras, frames, points = like.shape[1:-1]
+        nothing = torch.zeros(cameras, frames, points, dtype=torch.bool, device=like.device)
+        lenses = self.cameras if self.unknowns is None else self.unknowns.applied(self.cameras, self.nothing_found)
+        lens = lenses[index].to(like.dtype)
+        return _Solved(
+            torch.eye(3).to(like).expand(cameras, 3, 3),
+            like.new_zeros(cameras, 3),
+            lens.matrix,
+            lens.distortion,
+            self.nothing_found[index].to(like.dtype),
+            like.new_zeros(frames, points, 3),
+            nothing[0],
+            nothing,
+            like.new_zeros(points),
+            nothing[0, 0, 0],
+            status,
+        )
 
     def observations(self, index: int, sticks: Sequence[Stick]) -> Observations:
         """One session, without gradients."""
@@ -353,11 +385,33 @@ def _expanded(name: str, tensor: Tensor, shape: tuple[int, ...], like: Tensor) -
         raise ObservationError("the wrong shape", where=name, got=tuple(tensor.shape), expected=expected) from error
 
 
-def _with_batch(result: LayerResult) -> LayerResult:
+def _each(result: LayerResult, function: Callable[[Tensor], Tensor]) -> LayerResult:
+    """A result made of another, tensor by tensor."""
     tensors = {field.name: getattr(result, field.name) for field in fields(result) if field.name != "status"}
-    return replace(result, **{name: tensor[None] for name, tensor in tensors.items()})
+    return replace(result, **{name: tensor if tensor is None else function(tensor) for name, tensor in tensors.items()})
 
 
-def _without_batch(result: LayerResult) -> LayerResult:
-    tensors = {field.name: getattr(result, field.name) for field in fields(result) if field.name != "status"}
-    return replace(result, **{name: tensor[0] for name, tensor in tensors.items()})
+def _lenses(config: Config) -> tuple[str, ...]:
+    """What a configuration refines.
+
+    Raises:
+        ConfigError: if that is not of the lenses, or up to the data.
+    """
+    if config.refine == "auto":
+        raise ConfigError(
+            "the layer does not choose what to refine, which has no gradient",
+            where="config.refine",
+            got="'auto'",
+            expected="a list of what to refine",
+            remedy="Calibrate once with refine='auto', and give the layer what was refined.",
+        )
+    clocks = [name for name in config.refine if name in CLOCKS]
+    if clocks:
+        raise ConfigError(
+            "the layer takes clocks as given",
+            where="config.refine",
+            got=clocks,
+            expected="lenses only",
+            remedy="Calibrate once, and give the layer keypoints on one clock.",
+        )
+    return tuple(config.refine)

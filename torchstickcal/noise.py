@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from torchstickcal.losses.smoothness import complete_triples, stencil
-from torchstickcal.problem import Measurements
+from torchstickcal.problem import Measurements, State
 
 _CUT = 4.0
 _ROUNDS = 5
@@ -42,6 +42,25 @@ def estimate_sigma_px(measurements: Measurements, squared_residuals: Tensor) -> 
         variance = squared.where(kept, 0.0).sum((1, 2)) / freedom.clamp_min(1) / _truncated_moment(_CUT)
         variance = _draw_together(variance.clamp_min(_MIN_SIGMA_PX**2), freedom)
     return variance.sqrt()
+
+
+def residual_correlation(measurements: Measurements, state: State) -> float:
+    """How alike the residuals of a track are from one frame to the next, 0 to 1.
+
+    Independent noise has 0; what a camera's model gets wrong, or a detector gets wrong in the same way for a while, comes
+    close to 1, and then n residuals tell no more than ``n (1 - r) / (1 + r)`` independent ones would.
+    """
+    m, cameras = measurements, measurements.cameras_at(state)
+    alike, squares = torch.zeros(2, dtype=torch.float64, device=state.points.device)
+    for columns in m.chunks():
+        x, y, z = state.in_cameras(columns, m.pixels.dtype).unbind(-2)
+        weight = m.visible[..., columns].unsqueeze(-2)
+        residuals = torch.stack(cameras.project_components(x, y, z), dim=-2) - m.pixels_at(state, columns)
+        residuals = residuals.where(weight, torch.nan).double().unflatten(-1, (-1, m.points_per_frame))
+        before, after = residuals[..., :-1, :], residuals[..., 1:, :]
+        alike += (before * after).nansum()
+        squares += (before.square() + after.square()).where((before * after).isfinite(), 0.0).sum() / 2
+    return float((alike / squares.clamp_min(1e-300)).clamp(0.0, 1.0))
 
 
 def estimate_acceleration_m(measurements: Measurements, points: Tensor, point_covariance: Tensor) -> Tensor:

@@ -14,9 +14,9 @@ import torch
 from torch import Tensor
 
 from torchstickcal import se3
-from torchstickcal.camera_unknowns import Columns
+from torchstickcal.camera_unknowns import CameraUnknowns, Columns
 from torchstickcal.losses import CameraPointLoss, Loss, PairLoss, TrackLoss
-from torchstickcal.losses.base import CameraPointTerms, PairTerms, TrackTerms
+from torchstickcal.losses.base import CameraPointTerms, PairTerms, TrackTerms, UnknownTerms
 from torchstickcal.problem import Measurements, State
 
 PRIOR = "prior"
@@ -81,20 +81,26 @@ class Objective:
             values[PRIOR] = (unknowns / m.unknowns.prior_sigma).square().sum()
         return values
 
-    def slope(self, state: State, camera_step: Tensor, point_step: Tensor) -> Tensor:
+    def slope(self, state: State, camera_step: Tensor, point_step: Tensor, unknown_step: Tensor | None = None) -> Tensor:
         """Half the derivative of the objective along a step from a state, differentiable by measurements and state.
 
         Args:
             state: where.
             camera_step: (B, C, 6), tangents.
             point_step: (B, 3, N).
+            unknown_step: (B, K), of what else is unknown of the cameras; None where it stays as it is.
         """
         m = self.measurements
         moved = point_step[:, None] + se3.moved(se3.hat(camera_step[..., 3:]), camera_step[..., :3], state.points)
         points_cam, moved_cam = state.in_cameras(), state.rotations @ moved
+        cameras, pixels, image_step = m.cameras_at(state), m.pixels_at(state), None
         total = points_cam.new_zeros(())
+        if m.unknowns is not None and unknown_step is not None:
+            image_step = partial(m.unknowns.moved, cameras=cameras, motion=m.motion, step=unknown_step)
+            total = total + (_values(state, m.unknowns) * unknown_step / m.unknowns.prior_sigma.square()).sum()
         for name, loss in self._camera_point.items():
-            total = total + loss.slope(points_cam, moved_cam, m.pixels, m.confidence * self._information[name], m.cameras)
+            information = m.confidence * self._information[name]
+            total = total + loss.slope(points_cam, moved_cam, pixels, information, cameras, image_step)
         for loss in self._pair.values():
             difference, moved_ends = self._differences(state.points), self._differences(point_step)
             total = total + loss.slope(difference, moved_ends, m.lengths_m[:, None], m.pair_active)
@@ -110,21 +116,38 @@ class Objective:
         pixels, confidence = m.pixels_at(state, columns), m.confidence[..., columns]
         points_cam, rotations = state.in_cameras(columns, pixels.dtype), state.rotations.to(pixels.dtype)
         cameras, further = m.cameras_at(state), None
-        if m.unknowns is not None and by_unknowns:
-            motion = m.motion and m.motion.at(columns)
-            further = partial(m.unknowns.columns, cameras=cameras, motion=motion)
-        return {
-            name: loss.linearise(
-                points_cam,
-                rotations,
-                pixels,
-                confidence * self._information[name][..., columns],
-                cameras,
-                exact,
-                further,
-            )
-            for name, loss in self._camera_point.items()
-        }
+        unknowns = m.unknowns if by_unknowns else None
+        if unknowns is not None and not exact:
+            further = partial(unknowns.columns, cameras=cameras, motion=m.motion and m.motion.at(columns))
+        found: dict[str, CameraPointTerms] = {}
+        for name, loss in self._camera_point.items():
+            information = confidence * self._information[name][..., columns]
+            terms = loss.linearise(points_cam, rotations, pixels, information, cameras, exact, further)
+            if unknowns is not None and exact:
+                terms = terms._replace(unknown=self._exact_by_unknowns(loss, unknowns, state, columns, information))
+            found[name] = terms
+        return found
+
+    @torch.enable_grad()
+    def _exact_by_unknowns(
+        self, loss: CameraPointLoss, unknowns: CameraUnknowns, state: State, columns: Columns, information: Tensor
+    ) -> UnknownTerms:
+        """A loss's terms with the exact Hessian at columns of information (B, C, n): the slope's derivatives, by autograd."""
+        m = self.measurements
+        each, motion = unknowns.unshared(), m.motion and m.motion.at(columns)
+        if motion is not None:
+            motion = motion._replace(reckoned=unknowns.by_camera(motion.reckoned).flatten(1))
+        points_cam = state.in_cameras(columns).detach().requires_grad_()
+        values = unknowns.by_camera(_values(state, unknowns)).detach().requires_grad_()
+        step = torch.zeros_like(values).requires_grad_()
+        cameras = each.applied(m.cameras, values.flatten(1))
+        pixels = each.displaced(m.pixels[..., columns], values.flatten(1), motion)
+        image_step = partial(each.moved, cameras=cameras, motion=motion, step=step.flatten(1))
+        slope = loss.slope(points_cam, torch.zeros_like(points_cam), pixels, information, cameras, image_step)
+        (gradient,) = torch.autograd.grad(slope, step, create_graph=True)
+        rows = [torch.autograd.grad(row.sum(), (values, points_cam), retain_graph=True) for row in gradient.unbind(-1)]
+        hessian, by_points = (torch.stack(of, dim=2) for of in zip(*rows, strict=True))
+        return UnknownTerms(gradient.detach(), hessian, state.rotations.mT.unsqueeze(2) @ by_points)
 
     def linearise_prior(self, state: State) -> tuple[Tensor, Tensor, Tensor] | None:
         """The prior of the cameras' further unknowns: its value (B,), half its gradient (B, K), and its information (B, K)."""
@@ -132,7 +155,7 @@ class Objective:
         if unknowns is None:
             return None
         information = unknowns.prior_sigma.square().reciprocal()
-        values = torch.zeros_like(information) if state.unknowns is None else state.unknowns
+        values = _values(state, unknowns)
         return (information * values.square()).sum(1), information * values, information
 
     def linearise_pairs(self, state: State, exact: bool = False) -> dict[str, PairTerms]:
@@ -165,3 +188,8 @@ class Objective:
         information = loss.information(m.confidence)
         shape = (*information.shape[:1], 1) if information.ndim == 4 else (1, 1)
         return information.reshape(*shape, 1, -1).expand(*shape, m.frames, m.points_per_frame).flatten(2)
+
+
+def _values(state: State, unknowns: CameraUnknowns) -> Tensor:
+    """A state's values (B, K) of the cameras' further unknowns: those of cameras as given where it has none."""
+    return torch.zeros_like(unknowns.prior_sigma) if state.unknowns is None else state.unknowns

@@ -1,9 +1,9 @@
 """Tracks between their frames: where a point is, and how fast, when a camera looks a little before or after a frame.
 
 About each frame a polynomial goes through the frames around it, as many as it can follow: a slow track is smoothed over many
-frames, a fast swing is followed through every one. In an orthonormal basis by degree the noise of the points is the same in each
-coefficient, so coefficients that are no larger than noise are shrunk away (as Stein's estimate does, from the highest degree
-down). Little noise matters more than it seems: noise in the velocity makes a clock's offset seem smaller than it is.
+frames, a fast swing is followed through every one. In an orthonormal basis by degree the noise of the points is the same in
+each coefficient, so coefficients that are no larger than noise are shrunk away (as Stein's estimate does, from the highest
+degree down). Little noise matters more than it seems: noise in the velocity makes a clock's offset seem smaller than it is.
 """
 
 from __future__ import annotations

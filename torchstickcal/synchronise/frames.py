@@ -15,7 +15,8 @@ from torchstickcal.observations import Observations
 class CommonFrames:
     """A session whose cameras' frames stand beside each other: frame g of all cameras was exposed at about the same time.
 
-    Common frames are those of camera 0's clock, from its time 0 on. G frames are kept: from the first that two cameras have to the last.
+    Common frames are those of camera 0's clock, from its time 0 on. G of them are kept, from the first that two cameras have
+    to the last.
     """
 
     observations: Observations
