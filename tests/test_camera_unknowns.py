@@ -35,7 +35,7 @@ def unknown_rig(
     generator = torch.Generator().manual_seed(len(names))
     columns = slice(0, frames * measurements.points_per_frame)
     shape = measurements.confidence[..., columns].shape
-    velocity = 30 * torch.randn(*shape[:2], 2, shape[2], generator=generator, dtype=torch.float64)
+    velocity = 10 * torch.randn(*shape[:2], 2, shape[2], generator=generator, dtype=torch.float64)
     row = torch.rand(shape, generator=generator, dtype=torch.float64)
     distortion = LENSES[lens]
     matrix = measurements.cameras.matrix

@@ -126,12 +126,24 @@ class Adjuster:
             seen, state = search_focal(seen, self._settings, labels, self._known)
             refined = refined if "focal" in refined else with_refinements(refined, ("focal_shared",))
         self._took("initialise", time.perf_counter() - began)
-        return self._adjusted(frames, seen, refined, state)
+        seen = self._refining(seen, refined)
+        measurements, records = Exposures.of(frames).resting(seen), []
+        result = self._through(self._adjusting, measurements, _starting(seen, state), records)
+        return self._on_one_clock(Adjustment(frames, seen, measurements, tuple(refined), result, tuple(records)))
 
     def again(self, adjustment: Adjustment, refined: Sequence[str]) -> Adjustment:
-        """Adjust again from where an adjustment ended, with something else refined."""
-        start = replace(adjustment.result.state, unknowns=None)
-        return self._adjusted(adjustment.frames, adjustment.seen, refined, start)
+        """Adjust again from where an adjustment ended, with more refined; where that is clocks alone, the last stage does."""
+        seen, old = self._refining(adjustment.seen, refined), adjustment.result.state
+        state = _starting(seen, old, adjustment.seen.unknowns)
+        result = adjustment.result._replace(state=state)
+        measurements, records = Exposures.of(adjustment.frames).resting(seen), list(adjustment.records)
+        if _apart(adjustment):
+            measurements = _placed(adjustment, seen, state)
+        if set(refined) - set(adjustment.refined) - CLOCKS:
+            records = []
+            result = self._through(self._adjusting, measurements, state, records)
+        frames = adjustment.frames
+        return self._on_one_clock(Adjustment(frames, seen, measurements, tuple(refined), result, tuple(records)))
 
     def held(self, adjustment: Adjustment) -> Adjustment:
         """The stages that follow once the cameras are found."""
@@ -143,28 +155,23 @@ class Adjuster:
 
     def check(self, adjustment: Adjustment) -> CameraCheck:
         """What the data say of lenses and clocks where an adjustment ended."""
-        placed = _placed(Exposures.of(adjustment.frames), adjustment.seen, adjustment.measurements, adjustment.result)
-        kept = placed.keeping(adjustment.result.inliers)
-        result, groups = adjustment.result, self._settings.camera_groups
-        return CameraCheck(kept, result.state, result.sigma_px, adjustment.sigma_length_m, groups)
+        result = adjustment.result
+        kept = _placed(adjustment, adjustment.seen, result.state).keeping(result.inliers)
+        return CameraCheck(kept, result.state, result.sigma_px, adjustment.sigma_length_m, self._settings.camera_groups)
 
-    def _adjusted(self, frames: CommonFrames, seen: Measurements, refined: Sequence[str], state: State) -> Adjustment:
-        """Through the stages that adjust the cameras; where keypoints were not exposed together, the last one again and
-        again, with the keypoints brought to the common clock by the motion found so far."""
-        unknown = self._refining(seen, refined)
-        exposures, records = Exposures.of(frames), []
-        measurements = exposures.resting(unknown)
-        result = self._through(self._adjusting, measurements, state, records)
-        if exposures.apart or CLOCKS & set(refined):
-            last = list(self._adjusting.values())[-1]
-            for number in range(_MAX_CLOCK_ROUNDS):
-                placed = _placed(exposures, unknown, measurements, result)
-                moved = _movement(placed, measurements, result)
-                measurements = placed
-                if number > 0 and moved < _MOVED_SIGMAS:
-                    break
-                result = self._run(_CLOCK_STAGE, last, measurements, result.state, records)
-        return Adjustment(frames, unknown, measurements, tuple(refined), result, tuple(records))
+    def _on_one_clock(self, adjustment: Adjustment) -> Adjustment:
+        """Where keypoints were not exposed together, the last stage again and again, with the keypoints brought to the common
+        clock by the motion found so far."""
+        last, records = list(self._adjusting.values())[-1], list(adjustment.records)
+        for number in range(_MAX_CLOCK_ROUNDS if _apart(adjustment) else 0):
+            placed = _placed(adjustment, adjustment.seen, adjustment.result.state)
+            moved = _movement(placed, adjustment.measurements, adjustment.result)
+            adjustment = replace(adjustment, measurements=placed)
+            if number > 0 and moved < _MOVED_SIGMAS:
+                break
+            result = self._run(_CLOCK_STAGE, last, placed, adjustment.result.state, records)
+            adjustment = replace(adjustment, result=result, records=tuple(records))
+        return adjustment
 
     def _through(
         self, stages: Mapping[str, Stage], measurements: Measurements, state: State, records: list[StageRecord]
@@ -222,10 +229,26 @@ def _split(stages: Mapping[str, Stage]) -> tuple[dict[str, Stage], dict[str, Sta
     return {name: stages[name] for name in names[: last + 1]}, {name: stages[name] for name in names[last + 1 :]}
 
 
-def _placed(exposures: Exposures, seen: Measurements, adjusted: Measurements, result: StageResult) -> Measurements:
-    """Keypoints as seen, brought to the common clock by the motion that a stage has found from those adjusted."""
-    variance = point_variances(adjusted.keeping(result.inliers), result.state, result.sigma_px)
-    return exposures.placed(seen, result.state, variance, result.sigma_px)
+def _starting(seen: Measurements, state: State, before: CameraUnknowns | None = None) -> State:
+    """A state for the measurements' unknowns: those it has, of the unknowns before, and else what was given."""
+    if seen.unknowns is None:
+        return replace(state, unknowns=None)
+    nothing = torch.zeros_like(seen.unknowns.prior_sigma)
+    if before is None or state.unknowns is None:
+        return replace(state, unknowns=nothing)
+    return replace(state, unknowns=seen.unknowns.taken_over(before, state.unknowns))
+
+
+def _apart(adjustment: Adjustment) -> bool:
+    """Whether keypoints at one common frame were not, or need not have been, exposed together."""
+    return Exposures.of(adjustment.frames).apart or bool(CLOCKS & set(adjustment.refined))
+
+
+def _placed(adjustment: Adjustment, seen: Measurements, state: State) -> Measurements:
+    """Keypoints as seen, brought to the common clock at a state by the motion that an adjustment has found."""
+    result = adjustment.result
+    variance = point_variances(adjustment.kept, result.state, result.sigma_px)
+    return Exposures.of(adjustment.frames).placed(seen, state, variance, result.sigma_px)
 
 
 def _movement(placed: Measurements, before: Measurements, result: StageResult) -> float:

@@ -88,7 +88,7 @@ class CameraCheck:
         objective = normal_objective(looked_at, sigma_px, sigma_length_m)
         system = NormalEquations(objective, replace(state, unknowns=None), cameras_free=True)
         self._information, self._gradient = system.reduced[0], system.reduced_gradient[0]
-        correlation = residual_correlation(measurements, state)
+        correlation = residual_correlation(measurements, state, sigma_px)
         self._evidence = (1 - correlation) / (1 + correlation)
 
     def focal(self) -> FocalCheck:

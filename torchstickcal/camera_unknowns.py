@@ -263,6 +263,13 @@ class CameraUnknowns:
         """Every camera's own values (B, C, k), of the rig's (B, K)."""
         return torch.einsum("ckj,bj->bck", self.share, values)
 
+    def taken_over(self, others: CameraUnknowns, values: Tensor) -> Tensor:
+        """Values (B, K) that are those of others (B, K') where these know the kind, else zero; shared ones are means."""
+        by_kind = dict(zip((kind.name for kind in others.kinds), others.by_camera(values).unbind(-1), strict=True))
+        nothing = values.new_zeros(len(values), len(self.share))
+        own = torch.stack([by_kind.get(kind.name, nothing) for kind in self.kinds], dim=-1)
+        return torch.einsum("ckj,bck->bj", self.share, own) / self.share.sum((0, 1))
+
     def unshared(self) -> CameraUnknowns:
         """The same where every camera has a value of its own of every kind: K = C k, :meth:`by_camera` flattened."""
         cameras, kinds, _ = self.share.shape

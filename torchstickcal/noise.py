@@ -44,19 +44,25 @@ def estimate_sigma_px(measurements: Measurements, squared_residuals: Tensor) -> 
     return variance.sqrt()
 
 
-def residual_correlation(measurements: Measurements, state: State) -> float:
+def residual_correlation(measurements: Measurements, state: State, sigma_px: Tensor) -> float:
     """How alike the residuals of a track are from one frame to the next, 0 to 1.
 
     Independent noise has 0; what a camera's model gets wrong, or a detector gets wrong in the same way for a while, comes
     close to 1, and then n residuals tell no more than ``n (1 - r) / (1 + r)`` independent ones would.
+
+    Args:
+        measurements: those that took part.
+        state: the solution.
+        sigma_px: noise of each point's keypoints, (B, P).
     """
     m, cameras = measurements, measurements.cameras_at(state)
     alike, squares = torch.zeros(2, dtype=torch.float64, device=state.points.device)
     for columns in m.chunks():
         x, y, z = state.in_cameras(columns, m.pixels.dtype).unbind(-2)
-        weight = m.visible[..., columns].unsqueeze(-2)
+        seen = m.visible[..., columns].unsqueeze(-2)
         residuals = torch.stack(cameras.project_components(x, y, z), dim=-2) - m.pixels_at(state, columns)
-        residuals = residuals.where(weight, torch.nan).double().unflatten(-1, (-1, m.points_per_frame))
+        residuals = residuals.where(seen, torch.nan).double().unflatten(-1, (-1, m.points_per_frame))
+        residuals = residuals / sigma_px[:, None, None, None]
         before, after = residuals[..., :-1, :], residuals[..., 1:, :]
         alike += (before * after).nansum()
         squares += (before.square() + after.square()).where((before * after).isfinite(), 0.0).sum() / 2
