@@ -6,12 +6,14 @@ import argparse
 import json
 import sys
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from torchstickcal.errors import CalibrationError
 
 if TYPE_CHECKING:
+    from torchstickcal.config import Config
     from torchstickcal.io import Truth
     from torchstickcal.metrics import PoseErrors
     from torchstickcal.pipeline import Callback
@@ -46,9 +48,10 @@ def _parser() -> argparse.ArgumentParser:
     command.add_argument(
         "--refine",
         metavar="A,B|auto|none",
-        help="what to find of the lenses: focal, focal_shared, principal_point, radial, none, or auto for what the data "
-        "contradict (default: as configured)",
+        help="what to find of lenses and clocks: focal, focal_shared, principal_point, radial, time_offset, readout, none, or "
+        "auto for what the data contradict (default: as configured, else auto)",
     )
+    command.add_argument("--no-sync", action="store_true", help="take the cameras' clocks as told")
     command.add_argument("--stick-length", metavar="M", type=float, help="length of the stick in metres, if not the session's")
     command.add_argument("--tensorboard", metavar="DIR", type=Path, help="write a TensorBoard log of the calibration")
     command.set_defaults(run=_calibrate)
@@ -115,20 +118,36 @@ def _calibrate(options: argparse.Namespace) -> int:
     from torchstickcal.pipeline import calibrate
 
     _use_threads(options.threads)
-    config = load_config(options.config)
+    config, refine = _refining(load_config(options.config), options.refine, options.no_sync)
     observations, _ = read_session(options.session)
     if options.stick_length is not None:
         observations = observations.with_stick_length(options.stick_length)
-    calibration = calibrate(observations, config, _Progress(_monitor(options.tensorboard)), _refine(options.refine))
+    calibration = calibrate(observations, config, _Progress(_monitor(options.tensorboard)), refine)
     _write(calibration, options.out, {"session": str(options.session), "config": options.config})
     return _show(calibration, options.out)
 
 
-def _refine(option: str | None) -> Any:
-    """What the option says to refine; None where the configuration decides."""
-    if option in {None, "auto"}:
-        return option
-    return [] if option == "none" else str(option).split(",")
+def _refining(config: Config, option: str | None, no_sync: bool) -> tuple[Config, Any]:
+    """The configuration, and what to refine instead of what it says; None where it decides.
+
+    Raises:
+        CalibrationError: if clocks are both to be found and to be taken as told.
+    """
+    from torchstickcal.camera_unknowns import CLOCKS
+
+    refine: Any = option
+    if option is None:
+        refine = None if config.refine else "auto"
+    elif option != "auto":
+        refine = [] if option == "none" else option.split(",")
+    if no_sync and refine is not None and CLOCKS & set(refine):
+        raise CalibrationError(
+            "clocks are to be found and to be taken as told",
+            where="--no-sync",
+            got=f"--refine {option}",
+            expected="one of the two",
+        )
+    return (replace(config, synchronise=False) if no_sync else config), refine
 
 
 def _evaluate(options: argparse.Namespace) -> int:

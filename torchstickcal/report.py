@@ -6,6 +6,7 @@ from typing import Any
 
 import torch
 
+from torchstickcal.camera_unknowns import CLOCKS
 from torchstickcal.result import LENS_PARAMETERS, Calibration
 
 
@@ -30,8 +31,15 @@ def table(calibration: Calibration) -> str:
     for index, name in enumerate(calibration.camera_names):
         focal = float(calibration.intrinsics[index, [0, 1], [0, 1]].mean())
         ratio, std = float(calibration.focal_ratio[index]), float(calibration.focal_ratio_std[index])
-        rows.append([name, f"{focal:.2f}", f"{ratio:.4f} +- {std:.4f}", ", ".join(calibration.refined) or "-"])
+        found = ", ".join(kind for kind in calibration.refined if kind not in CLOCKS)
+        rows.append([name, f"{focal:.2f}", f"{ratio:.4f} +- {std:.4f}", found or "-"])
     text += [_aligned(rows), ""]
+    if calibration.times is not None:
+        rows = [["clock", "late (ms)", "data - used (ms)", "found"]]
+        for index, name in enumerate(calibration.camera_names):
+            offset, late = (_milliseconds(calibration, part, index) for part in ("time_offsets", "late"))
+            rows.append([name, offset, late, ", ".join(kind for kind in calibration.refined if kind in CLOCKS) or "-"])
+        text += [_aligned(rows), ""]
     if calibration.sticks:
         rows = [["stick", "given (m)", "mean (m)", "spread (mm)", "frames"]]
         for stick, lengths in zip(calibration.sticks, calibration.stick_lengths_m.mT, strict=True):
@@ -99,6 +107,27 @@ def summary(calibration: Calibration) -> dict[str, Any]:
                 strict=True,
             )
         ],
+        "clocks": [
+            {
+                "name": name,
+                "time_offset_s": offset,
+                "time_offset_std_s": offset_std,
+                "data_minus_used_s": _finite(late),
+                "data_minus_used_std_s": _finite(late_std),
+                "readout_s": readout,
+                "readout_std_s": readout_std,
+            }
+            for name, offset, offset_std, late, late_std, readout, readout_std in zip(
+                calibration.camera_names,
+                calibration.time_offsets.tolist(),
+                calibration.time_offsets_std.tolist(),
+                calibration.late,
+                calibration.late_std,
+                calibration.readout.tolist(),
+                calibration.readout_std.tolist(),
+                strict=True,
+            )
+        ],
         "points": [
             {"name": _point_name(calibration, index), "sigma_px": sigma}
             for index, sigma in enumerate(calibration.sigma_px.tolist())
@@ -129,6 +158,11 @@ def summary(calibration: Calibration) -> dict[str, Any]:
         "seconds": calibration.seconds,
         "warnings": list(calibration.warnings),
     }
+
+
+def _milliseconds(calibration: Calibration, part: str, camera: int) -> str:
+    value, std = (1000 * float(getattr(calibration, name)[camera]) for name in (part, f"{part}_std"))
+    return f"{value:.2f} +- {std:.2f}"
 
 
 def _keypoints_used(calibration: Calibration) -> list[int]:

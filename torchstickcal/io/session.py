@@ -118,8 +118,9 @@ def read_npz(path: str | Path) -> tuple[Observations, Truth | None]:
 
     Arrays: ``keypoints`` (C, F, P, 2), NaN where not seen; ``intrinsics`` (C, 3, 3); ``stick_start``, ``stick_end`` and
     ``stick_length_m`` (S,); optional ``confidence`` (C, F, P), ``distortion`` (C, D), ``image_size`` (C, 2), ``names`` (P),
-    ``camera_names`` (C), ``fps``, and as truth ``rotation`` (C, 3, 3), ``translation`` (C, 3), ``points`` (F, P, 3),
-    ``true_intrinsics`` (C, 3, 3), ``true_distortion`` (C, D), ``time_offsets_s`` (C), ``readout_s`` (C).
+    ``camera_names`` (C), ``fps``, ``timestamps`` (C, F), ``known_readout_s``, and as truth ``rotation`` (C, 3, 3),
+    ``translation`` (C, 3), ``points`` (F, P, 3), ``true_intrinsics`` (C, 3, 3), ``true_distortion`` (C, D),
+    ``time_offsets_s`` (C), ``readout_s`` (C).
 
     Raises:
         FileFormatError: if an array is missing or the file is damaged.
@@ -142,6 +143,8 @@ def read_npz(path: str | Path) -> tuple[Observations, Truth | None]:
             point_names=list(data["names"]) if "names" in data else None,
             camera_names=list(data["camera_names"]) if "camera_names" in data else None,
             fisheye=bool(data.get("fisheye", False)),
+            timestamps=data.get("timestamps"),
+            readout_s=float(data["known_readout_s"]) if "known_readout_s" in data else None,
         )
         if "rotation" not in data:
             return observations, None
@@ -166,10 +169,15 @@ def write_npz(
         "stick_length_m": np.array([stick.length_m for stick in observations.sticks], dtype=np.float64),
         "fisheye": np.array(observations.fisheye),
     }
-    for name in ("distortion", "confidence", "image_size"):
+    for name in ("distortion", "confidence", "image_size", "timestamps"):
         if (tensor := getattr(observations, name)) is not None:
             arrays[name] = tensor.cpu().numpy()
-    optional = {"fps": observations.fps, "names": observations.point_names, "camera_names": observations.camera_names}
+    optional = {
+        "fps": observations.fps,
+        "names": observations.point_names,
+        "camera_names": observations.camera_names,
+        "known_readout_s": observations.readout_s,
+    }
     arrays |= {name: np.array(value) for name, value in optional.items() if value is not None}
     if truth is not None:
         known = {array: getattr(truth, name) for name, array in _TRUTH_ARRAYS.items()}

@@ -1,0 +1,194 @@
+"""What it costs not to know lenses and clocks: simulated sessions in which what is told is wrong, against the same told right.
+
+    python examples/benchmark_lenses_and_clocks.py lenses --seeds 30 --cameras 3 6
+    python examples/benchmark_lenses_and_clocks.py clocks --seeds 30 --rates 30 60 120
+
+Sports take turns from seed to seed. A lens's row sets the mean camera error against the Cramer-Rao bound for those who do not
+know that lens; a clock's row against the error of the same session with its cameras in step: the same frames overlap, and the
+same noise was drawn. The last columns say how far the stated standard deviations of the unknowns themselves are honest.
+"""
+
+from __future__ import annotations
+
+import argparse
+import statistics
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from torchstickcal import Calibration, Observations, calibrate
+from torchstickcal.benchmark.bound import camera_bound
+from torchstickcal.benchmark.cases import Case
+from torchstickcal.metrics import pose_errors
+from torchstickcal.simulate import Clocks, Lens, SessionSpec, SimulatedSession
+from torchstickcal.simulate.regimes import DetectorNoise, Gaps, GaussianNoise
+from torchstickcal.simulate.session import Assumptions
+from torchstickcal.synchronise import on_common_frames
+
+SPORTS = ("golf", "baseball", "hockey", "kendo", "wand")
+BARREL = Lens(distortion=(-0.2, 0.0, 0.0, 0.0, 0.0))
+VIDEO = Lens(distortion=(-0.1, 0.02, 0.0005, -0.0005, 0.0))
+
+
+class Outcome(NamedTuple):
+    """One session."""
+
+    error_m: float
+    reference_m: float
+    """the bound, or the error where nothing was wrong"""
+    normal: NDArray[np.float64]
+    """errors of the unknowns found, in their stated standard deviations"""
+    seconds: float
+
+
+@dataclass(frozen=True)
+class InStep(Clocks):
+    """The same offsets as those of :class:`Clocks`, rounded to whole frames of a rate."""
+
+    fps: float = 1.0
+
+    def offsets(self, cameras: int, rng: np.random.Generator) -> NDArray[np.float64]:
+        return np.round(super().offsets(cameras, rng) * self.fps) / self.fps
+
+
+def main() -> None:
+    """Print a table."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("what", nargs="?", choices=("lenses", "clocks"), default="clocks")
+    parser.add_argument("--seeds", type=int, default=1)
+    parser.add_argument("--cameras", type=int, nargs="+", default=[6])
+    parser.add_argument("--rates", type=int, nargs="+", default=[60], help="frames per second, of clocks")
+    options = parser.parse_args()
+    against = "bound" if options.what == "lenses" else "in step"
+    print(f"| cameras | what is wrong | refine | mean error (mm) | over {against} | largest | e2 | within 3 sigma | time (s) |")
+    print("|---|---|---|---|---|---|---|---|---|")
+    for cameras in options.cameras:
+        rows = lenses(cameras) if options.what == "lenses" else clocks(cameras, options.rates)
+        for name, refine, measure in rows:
+            outcomes = [measure(seed) for seed in range(options.seeds)]
+            print(f"| {cameras} | {name} | {'+'.join(refine)} | {row(outcomes)} |", flush=True)
+
+
+Row = tuple[str, tuple[str, ...], Callable[[int], Outcome]]
+
+
+def row(outcomes: list[Outcome]) -> str:
+    """The cells of one row."""
+    ratios = [outcome.error_m / outcome.reference_m for outcome in outcomes]
+    mean, reference = (statistics.fmean(getattr(o, part) for o in outcomes) for part in ("error_m", "reference_m"))
+    normal = np.concatenate([outcome.normal for outcome in outcomes])
+    honest = f"{np.mean(normal**2):.2f} | {np.mean(np.abs(normal) < 3):.1%}" if len(normal) else "- | -"
+    seconds = statistics.median(outcome.seconds for outcome in outcomes)
+    return f"{1000 * mean:.2f} | {mean / reference:.2f} | {max(ratios):.2f} | {honest} | {seconds:.2f}"
+
+
+def lenses(cameras: int) -> Iterator[Row]:
+    """Focal lengths and distortion."""
+    spec = SessionSpec("lens", "golf", 0, cameras, frames=300, regimes=(GaussianNoise(1.0),))
+    yield "nothing", (), lens_row(spec, ())
+    for scale in (1.03, 0.97, 1.1, 0.9):
+        told = replace(spec, assumptions=Assumptions(focal_scale=scale))
+        yield f"focal lengths, all {scale:g} x", ("focal_shared",), lens_row(told, ("focal_shared",))
+    for spread in (0.03, 0.1):
+        told = replace(spec, assumptions=Assumptions(focal_spread=spread))
+        yield f"focal lengths, each by {spread:.0%}", ("focal",), lens_row(told, ("focal",))
+    told = replace(spec, lens=BARREL, assumptions=Assumptions(lens_known=False))
+    yield "k1 = -0.2 told as 0", ("radial",), lens_row(told, ("radial",))
+    told = replace(spec, assumptions=Assumptions(focal_scale=1.03))
+    yield "focal lengths, all 1.03 x", ("auto",), lens_row(told, ("focal_shared",), "auto")
+    yield "nothing told but the image size", ("focal_shared",), lens_row(spec, ("focal_shared",), (), unknown_lens)
+
+
+def lens_row(
+    spec: SessionSpec,
+    unknown: tuple[str, ...],
+    refine: tuple[str, ...] | str | None = None,
+    told: Callable[[Observations], Observations] = lambda observations: observations,
+) -> Callable[[int], Outcome]:
+    """A measurement by seed, against the bound for those who do not know what is ``unknown``."""
+
+    def measure(seed: int) -> Outcome:
+        session = replace(spec, seed=seed, sport=SPORTS[seed % 4]).generate()
+        found, seconds = timed(told(session.observations), unknown if refine is None else refine)
+        case = Case(session.name, session.observations, session.truth, session.inliers, session.sigma_px)
+        bound = camera_bound(case, unknown=unknown)
+        assert bound is not None
+        return Outcome(error_m(found, session), bound.translation_m, lens_errors(found, session, unknown), seconds)
+
+    return measure
+
+
+def unknown_lens(observations: Observations) -> Observations:
+    """A session of which only the image size is known."""
+    return Observations(
+        observations.keypoints, None, observations.sticks, image_size=observations.image_size, fps=observations.fps
+    )
+
+
+def lens_errors(found: Calibration, session: SimulatedSession, unknown: tuple[str, ...]) -> NDArray[np.float64]:
+    """Errors of focal lengths or k1 in their stated standard deviations; a shared one counts once."""
+    truth = session.truth
+    assert truth.intrinsics is not None
+    if "radial" in unknown:
+        assert found.distortion is not None
+        assert truth.distortion is not None
+        return ((found.distortion[:, 0] - truth.distortion[:, 0]) / found.lens_std[:, 3]).numpy()
+    off = (found.intrinsics[:, 0, 0] / truth.intrinsics[:, 0, 0] - 1) / found.lens_std[:, 0]
+    return off.numpy()[: 1 if "focal_shared" in unknown else None] if unknown else np.zeros(0)
+
+
+def clocks(cameras: int, rates: list[int]) -> Iterator[Row]:
+    """Offsets and rolling shutters, at real speed."""
+    for fps in rates:
+        spec = SessionSpec(
+            "clock", "golf", 0, cameras, 300, float(fps), "ring", VIDEO, 4.5, "circle",
+            regimes=(DetectorNoise(3.0, 1.5), Gaps(0.15)),
+        )  # fmt: skip
+        for name, wrong, refine in (
+            ("nothing", Clocks(), ("time_offset",)),
+            ("offsets to 1 s", Clocks(1.0), ("time_offset",)),
+            ("offsets to 1 s, 15 ms read-out", Clocks(1.0, 0.015), ("time_offset", "readout")),
+            ("offsets to 1 s", Clocks(1.0), ("auto",)),
+        ):
+            yield f"{name}, {fps} Hz", refine, clock_row(replace(spec, clocks=wrong), refine)
+
+
+def clock_row(spec: SessionSpec, refine: tuple[str, ...]) -> Callable[[int], Outcome]:
+    """A measurement by seed, against the same session with its cameras in step."""
+
+    def measure(seed: int) -> Outcome:
+        wrong = replace(spec, seed=seed, sport=SPORTS[seed % 5])
+        session = wrong.generate()
+        right = replace(wrong, clocks=InStep(wrong.clocks.offset_s, fps=wrong.fps)).generate()
+        assert right.truth.time_offsets_s is not None
+        assert session.truth.time_offsets_s is not None
+        in_step = on_common_frames(right.observations, (right.truth.time_offsets_s * wrong.fps).round()).observations
+        reference = error_m(calibrate(in_step), right)
+        found, seconds = timed(session.observations, refine if refine != ("auto",) else "auto")
+        off = (found.time_offsets - session.truth.time_offsets_s) / found.time_offsets_std
+        return Outcome(error_m(found, session), reference, off[1:].numpy(), seconds)
+
+    return measure
+
+
+def timed(observations: Observations, refine: tuple[str, ...] | str) -> tuple[Calibration, float]:
+    """A calibration and the seconds it took."""
+    began = time.perf_counter()
+    found = calibrate(observations, refine=refine)  # pyright: ignore[reportArgumentType]
+    return found, time.perf_counter() - began
+
+
+def error_m(found: Calibration, session: SimulatedSession) -> float:
+    """Mean camera error, metres."""
+    truth = session.truth
+    return pose_errors(found.rotations, found.translations, truth.rotations, truth.translations).mean_translation_m
+
+
+if __name__ == "__main__":
+    torch.set_num_threads(1)
+    main()
