@@ -2,17 +2,24 @@
 
 ``aniposelib.init.calibrate_from_points`` as its README gives it ("Keypoint self-calibration"): structure from motion, robust
 adjustment of the extrinsics, then the scale of ``aniposelib.scale.from_lengths``. That wants three views of a stick end that
-agree; where too few have them it is asked again with two.
+agree; where too few have them it is asked again with two. Its quality report is made afterwards, not timed.
+
+Intrinsics are known and held, as in the recipe; ``ANIPOSE_REFINE`` in the environment lists those that its adjustment frees in
+each camera at the end: ``fx,fy,cx,cy,k1,k2`` is what its adjustment frees by itself outside the recipe, ``f`` one focal length.
 """
 
 from __future__ import annotations
 
+import os
 import time
 
 import numpy as np
-from aniposelib import scale
+from aniposelib import quality, scale
 from aniposelib.init import calibrate_from_points
+from aniposelib.params import ParamSpec
 from sessions import Found, NotCalibratedError, Session, main
+
+REFINE = tuple(filter(None, os.environ.get("ANIPOSE_REFINE", "").split(",")))
 
 
 def calibrate(session: Session) -> Found:
@@ -29,7 +36,8 @@ def calibrate(session: Session) -> Found:
         for name, matrix, lens in zip(names, session.matrices, session.distortion, strict=True)
     }
     began = time.perf_counter()
-    group, _ = calibrate_from_points(keypoints, names, session.sizes, lenses, report=False, rng=0)
+    adjustment = {"only_extrinsics": not REFINE, "spec": ParamSpec(intrinsics=REFINE, n_dist=0)}
+    group, _ = calibrate_from_points(keypoints, names, session.sizes, lenses, ba_kwargs=adjustment, report=False, rng=0)
     if len(group.cameras) < len(names):
         raise NotCalibratedError(f"{len(group.cameras)} of {len(names)} cameras placed")
     found = scale.from_lengths(group, keypoints, [session.stick], [session.stick_length_m])
@@ -38,7 +46,8 @@ def calibrate(session: Session) -> Found:
     found.apply(group)
     seconds = time.perf_counter() - began
     poses = np.stack([camera.get_extrinsics_mat().detach().numpy() for camera in group.cameras])
-    return Found(poses[:, :3, :3], poses[:, :3, 3], seconds)
+    failures = quality.report(group, keypoints).failures()
+    return Found(poses[:, :3, :3], poses[:, :3, 3], seconds, "; ".join(failures) or "done")
 
 
 if __name__ == "__main__":
