@@ -6,6 +6,10 @@ agree; where too few have them it is asked again with two. Its quality report is
 
 Intrinsics are known and held, as in the recipe; ``ANIPOSE_REFINE`` in the environment lists those that its adjustment frees in
 each camera at the end: ``fx,fy,cx,cy,k1,k2`` is what its adjustment frees by itself outside the recipe, ``f`` one focal length.
+
+Clocks are taken to agree; ``ANIPOSE_CLOCKS=offsets`` has ``aniposelib.stba.SpatiotemporalBA`` go on from there with its own
+options: points on splines, an offset of each camera's clock. ``offsets,readout`` finds the time that each sensor takes to be
+read out, too. The stick's median length on the splines then gives the scale, and no report is made.
 """
 
 from __future__ import annotations
@@ -14,12 +18,14 @@ import os
 import time
 
 import numpy as np
-from aniposelib import quality, scale
+from aniposelib import CameraGroup, quality, scale
 from aniposelib.init import calibrate_from_points
 from aniposelib.params import ParamSpec
-from sessions import Found, NotCalibratedError, Session, main
+from aniposelib.stba import SpatiotemporalBA, TimedObservations
+from sessions import Array, Found, NotCalibratedError, Session, main, stick_scale
 
 REFINE = tuple(filter(None, os.environ.get("ANIPOSE_REFINE", "").split(",")))
+CLOCKS = os.environ.get("ANIPOSE_CLOCKS", "").split(",")
 
 
 def calibrate(session: Session) -> Found:
@@ -44,10 +50,22 @@ def calibrate(session: Session) -> Found:
     if not found.accepted:
         found = scale.from_lengths(group, keypoints, [session.stick], [session.stick_length_m], min_inliers=2)
     found.apply(group)
+    if "offsets" in CLOCKS:
+        group = _with_clocks(session, group, keypoints)
     seconds = time.perf_counter() - began
     poses = np.stack([camera.get_extrinsics_mat().detach().numpy() for camera in group.cameras])
-    failures = quality.report(group, keypoints).failures()
+    failures = [] if "offsets" in CLOCKS else quality.report(group, keypoints).failures()
     return Found(poses[:, :3, :3], poses[:, :3, 3], seconds, "; ".join(failures) or "done")
+
+
+def _with_clocks(session: Session, group: CameraGroup, keypoints: Array) -> CameraGroup:
+    """The cameras adjusted together with their clocks, in metres again."""
+    times = np.arange(keypoints.shape[1]) / session.fps
+    observations = TimedObservations.from_dense(keypoints, times)
+    found = SpatiotemporalBA(group, observations, rolling_shutter="readout" in CLOCKS).fit()
+    points = np.stack([found.trajectories.evaluate(times, point) for point in range(keypoints.shape[2])], axis=1)
+    scale.rescale(found.group, stick_scale(session, points))
+    return found.group
 
 
 if __name__ == "__main__":
