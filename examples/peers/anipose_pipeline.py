@@ -55,7 +55,7 @@ def calibrate(session: Session) -> Found:
     seconds = time.perf_counter() - began
     poses = np.stack([camera.get_extrinsics_mat().detach().numpy() for camera in group.cameras])
     failures = [] if "offsets" in CLOCKS else quality.report(group, keypoints).failures()
-    return Found(poses[:, :3, :3], poses[:, :3, 3], seconds, "; ".join(failures) or "done")
+    return Found(poses[:, :3, :3], poses[:, :3, 3], seconds, "; ".join(failure[:60] for failure in failures) or "done")
 
 
 def _with_clocks(session: Session, group: CameraGroup, keypoints: Array) -> CameraGroup:
