@@ -2,17 +2,30 @@
 
 ``aniposelib.init.calibrate_from_points`` as its README gives it ("Keypoint self-calibration"): structure from motion, robust
 adjustment of the extrinsics, then the scale of ``aniposelib.scale.from_lengths``. That wants three views of a stick end that
-agree; where too few have them it is asked again with two.
+agree; where too few have them it is asked again with two. Its quality report is made afterwards, not timed.
+
+Intrinsics are known and held, as in the recipe; ``ANIPOSE_REFINE`` in the environment lists those that its adjustment frees in
+each camera at the end: ``fx,fy,cx,cy,k1,k2`` is what its adjustment frees by itself outside the recipe, ``f`` one focal length.
+
+Clocks are taken to agree; ``ANIPOSE_CLOCKS=offsets`` has ``aniposelib.stba.SpatiotemporalBA`` go on from there with its own
+options: points on splines, an offset of each camera's clock. ``offsets,readout`` finds the time that each sensor takes to be
+read out, too. The stick's median length on the splines then gives the scale, and no report is made.
 """
 
 from __future__ import annotations
 
+import os
 import time
 
 import numpy as np
-from aniposelib import scale
+from aniposelib import CameraGroup, quality, scale
 from aniposelib.init import calibrate_from_points
-from sessions import Found, NotCalibratedError, Session, main
+from aniposelib.params import ParamSpec
+from aniposelib.stba import SpatiotemporalBA, TimedObservations
+from sessions import Array, Found, NotCalibratedError, Session, main, stick_scale
+
+REFINE = tuple(filter(None, os.environ.get("ANIPOSE_REFINE", "").split(",")))
+CLOCKS = os.environ.get("ANIPOSE_CLOCKS", "").split(",")
 
 
 def calibrate(session: Session) -> Found:
@@ -29,16 +42,30 @@ def calibrate(session: Session) -> Found:
         for name, matrix, lens in zip(names, session.matrices, session.distortion, strict=True)
     }
     began = time.perf_counter()
-    group, _ = calibrate_from_points(keypoints, names, session.sizes, lenses, report=False, rng=0)
+    adjustment = {"only_extrinsics": not REFINE, "spec": ParamSpec(intrinsics=REFINE, n_dist=0)}
+    group, _ = calibrate_from_points(keypoints, names, session.sizes, lenses, ba_kwargs=adjustment, report=False, rng=0)
     if len(group.cameras) < len(names):
         raise NotCalibratedError(f"{len(group.cameras)} of {len(names)} cameras placed")
     found = scale.from_lengths(group, keypoints, [session.stick], [session.stick_length_m])
     if not found.accepted:
         found = scale.from_lengths(group, keypoints, [session.stick], [session.stick_length_m], min_inliers=2)
     found.apply(group)
+    if "offsets" in CLOCKS:
+        group = _with_clocks(session, group, keypoints)
     seconds = time.perf_counter() - began
     poses = np.stack([camera.get_extrinsics_mat().detach().numpy() for camera in group.cameras])
-    return Found(poses[:, :3, :3], poses[:, :3, 3], seconds)
+    failures = [] if "offsets" in CLOCKS else quality.report(group, keypoints).failures()
+    return Found(poses[:, :3, :3], poses[:, :3, 3], seconds, "; ".join(failure[:60] for failure in failures) or "done")
+
+
+def _with_clocks(session: Session, group: CameraGroup, keypoints: Array) -> CameraGroup:
+    """The cameras adjusted together with their clocks, in metres again."""
+    times = np.arange(keypoints.shape[1]) / session.fps
+    observations = TimedObservations.from_dense(keypoints, times)
+    found = SpatiotemporalBA(group, observations, rolling_shutter="readout" in CLOCKS).fit()
+    points = np.stack([found.trajectories.evaluate(times, point) for point in range(keypoints.shape[2])], axis=1)
+    scale.rescale(found.group, stick_scale(session, points))
+    return found.group
 
 
 if __name__ == "__main__":

@@ -45,7 +45,8 @@ def calibrate(session: Session) -> Found:
         raise NotCalibratedError(f"{len(placed)} of {len(session.keypoints)} cameras placed")
     found = [placed[index] for index in range(len(placed))]
     rotations = np.stack([np.asarray(camera.rotation, dtype=float) for camera in found])
-    return Found(rotations, np.stack([np.asarray(camera.translation, dtype=float).ravel() for camera in found]), seconds)
+    translations = np.stack([np.asarray(camera.translation, dtype=float).ravel() for camera in found])
+    return Found(rotations, translations, seconds, "intrinsics not refined" if run.intrinsic_refinement_gated else "done")
 
 
 def _image_points(session: Session) -> ImagePoints:

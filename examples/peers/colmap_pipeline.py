@@ -1,9 +1,10 @@
 """COLMAP: geometric verification and incremental mapping; the scale from the stick afterwards.
 
 The rig stands still, so that a camera is one image whose features are its keypoints of all frames; a point of a frame seen by
-two cameras is a match. Intrinsics are known and held. Points that only two cameras see are used: COLMAP ignores them
-unless told otherwise, and then refuses rigs of two cameras and loses the stick in rigs of three. Every other option is
-COLMAP's own; ``COLMAP_MAX_ERROR_PX`` in the environment replaces its 4 pixels, the largest error of an inlier. Timed are
+two cameras is a match. Intrinsics are known and held; ``COLMAP_REFINE=focal`` in the environment frees both focal lengths of
+each camera, ``COLMAP_REFINE=focal,extra`` distortion too, as COLMAP does by default. Points that only two cameras see are used:
+COLMAP ignores them unless told otherwise, and then refuses rigs of two cameras and loses the stick in rigs of three. Every
+other option is COLMAP's own; ``COLMAP_MAX_ERROR_PX`` replaces its 4 pixels, the largest error of an inlier. Timed are
 verification, mapping and scaling, without filling the database.
 """
 
@@ -20,6 +21,7 @@ import pycolmap
 from numpy.typing import NDArray
 from sessions import Found, NotCalibratedError, Session, main, stick_scale
 
+REFINE = os.environ.get("COLMAP_REFINE", "").split(",")
 MAX_ERROR_PX = float(os.environ.get("COLMAP_MAX_ERROR_PX", "4"))
 
 
@@ -51,16 +53,17 @@ def _fill_database(session: Session, folder: Path) -> list[NDArray[np.int64]]:
     visible = session.visible.reshape(len(session.keypoints), -1)
     columns = [np.flatnonzero(seen) for seen in visible]
     database = pycolmap.Database.open(folder / "database.db")
+    model, coefficients = ("FULL_OPENCV", 8) if session.distortion[:, 4:].any() else ("OPENCV", 4)
     for index, keypoints in enumerate(session.keypoints.reshape(len(visible), -1, 2)):
         matrix, (width, height) = session.matrices[index], session.sizes[index]
         lens = np.zeros(8)
         lens[: session.distortion.shape[1]] = session.distortion[index]
         camera = pycolmap.Camera(
             camera_id=index + 1,
-            model="FULL_OPENCV",
+            model=model,
             width=int(width),
             height=int(height),
-            params=[matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2], *lens],
+            params=[matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2], *lens[:coefficients]],
             has_prior_focal_length=True,
         )
         database.write_camera(camera, use_camera_id=True)
@@ -84,10 +87,11 @@ def _verification_options() -> pycolmap.TwoViewGeometryOptions:
 
 
 def _mapping_options() -> pycolmap.IncrementalPipelineOptions:
+    focal, extra = "focal" in REFINE, "extra" in REFINE
     options = pycolmap.IncrementalPipelineOptions(
-        ba_refine_focal_length=False, ba_refine_principal_point=False, ba_refine_extra_params=False, extract_colors=False
+        ba_refine_focal_length=focal, ba_refine_principal_point=False, ba_refine_extra_params=extra, extract_colors=False
     )
-    options.mapper.abs_pose_refine_focal_length = options.mapper.abs_pose_refine_extra_params = False
+    options.mapper.abs_pose_refine_focal_length, options.mapper.abs_pose_refine_extra_params = focal, extra
     options.mapper.init_max_error = options.mapper.filter_max_reproj_error = MAX_ERROR_PX
     options.triangulation.ignore_two_view_tracks = False
     options.triangulation.merge_max_reproj_error = options.triangulation.complete_max_reproj_error = MAX_ERROR_PX

@@ -7,7 +7,7 @@ Every peer has written a file of JSON lines from the same sessions with its own 
 A calibration succeeds if its mean camera error, of centres after a rigid alignment without scale, is within three times the
 bound: what an estimate could expect that knew which keypoints are gross errors, the noise of all others, the lenses, and the
 stick to a millimetre. A session that a peer gave up, refused or did not finish in time counts as a failure; medians are over
-the sessions calibrated, of wall times over all that ended.
+the sessions calibrated, of wall times over all that ended. Remarks are sessions calibrated, with something to say about it.
 """
 
 from __future__ import annotations
@@ -17,6 +17,7 @@ import statistics
 import time
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -58,10 +59,12 @@ def main() -> None:
     """Print the table, and write the scores."""
     parser = arguments(__doc__)
     parser.add_argument("--peer", action="append", default=[], metavar="NAME=FILE", help="a peer's JSON lines")
+    parser.add_argument("--refine", metavar="A,B|auto|none", help="what torchstickcal is to find of the lenses (as configured)")
     parser.add_argument("--out", type=Path, help="JSON lines of all scores")
     options = parser.parse_args()
     files = session_files(options.sessions)
-    lines = {HERE: list(measured(calibrate, files, options.timeout, options.repeats))}
+    ours = partial(calibrate, refine=refinements(options.refine))
+    lines = {HERE: list(measured(ours, files, options.timeout, options.repeats))}
     for peer in options.peer:
         name, _, file = peer.partition("=")
         lines[name] = [json.loads(line) for line in Path(file).read_text("utf-8").splitlines()]
@@ -76,8 +79,15 @@ def main() -> None:
     print("\n".join(table(scores, bounds)))
 
 
-def calibrate(session: Session) -> Found:
-    """The calibration that the peers are compared with, in its default configuration."""
+def refinements(option: str | None) -> Any:
+    """The option as :func:`torchstickcal.calibrate` takes it."""
+    if option in {None, "auto"}:
+        return option
+    return [] if option == "none" else str(option).split(",")
+
+
+def calibrate(session: Session, refine: Any = None) -> Found:
+    """The calibration that the peers are compared with, in its default configuration but for what it refines."""
     observations = Observations(
         session.keypoints,
         session.matrices,
@@ -88,9 +98,10 @@ def calibrate(session: Session) -> Found:
         fps=session.fps,
     )
     began = time.perf_counter()
-    found = calibrate_here(observations)
+    found = calibrate_here(observations, refine=refine)
     seconds = time.perf_counter() - began
-    return Found(found.rotations.numpy(), found.translations.numpy(), seconds)
+    said = [*([] if found.converged else [found.status]), *found.warnings]
+    return Found(found.rotations.numpy(), found.translations.numpy(), seconds, "; ".join(said) or "done")
 
 
 def score(line: dict[str, Any], session: SimulatedSession) -> Score:
@@ -137,9 +148,9 @@ def table(scores: dict[str, list[Score]], bounds: dict[str, float]) -> list[str]
     own = statistics.median(s.seconds for s in scores[HERE])
     bound_mm = 1000 * statistics.median(bounds.values())
     rows = [
-        f"| {len(bounds)} sessions, bound {bound_mm:.1f} mm | calibrated | success | rotation | centres | error / bound "
-        "| wall time | ratio | time-outs |",
-        "|---|---|---|---|---|---|---|---|---|",
+        f"| {len(bounds)} sessions, bound {bound_mm:.1f} mm | calibrated | success | rotation | centres | worst "
+        "| error / bound | wall time | ratio | time-outs | remarks |",
+        "|---|---|---|---|---|---|---|---|---|---|---|",
     ]
     for name, found in scores.items():
         calibrated = [s for s in found if s.translation_m is not None]
@@ -152,10 +163,12 @@ def table(scores: dict[str, list[Score]], bounds: dict[str, float]) -> list[str]
             f"{100 * share:.0f} %",
             f"{_median([s.rotation_deg for s in calibrated]):.3f} deg",
             f"{1000 * _median([s.translation_m for s in calibrated]):.1f} mm",
+            f"{1000 * max((s.translation_m for s in calibrated), default=float('nan')):.1f} mm",
             f"{_median([(s.translation_m or 0.0) / bounds[s.name] for s in calibrated]):.2f}",
             f"{seconds:.2f} s",
             f"{seconds / own:.1f} x",
             f"{len(found) - len(ended)}",
+            f"{sum(s.status != 'done' for s in calibrated)}",
         ]
         rows.append(f"| {' | '.join(cells)} |")
     return rows

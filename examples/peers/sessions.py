@@ -51,7 +51,7 @@ class Session:
 
 
 class Found(NamedTuple):
-    """What a peer hands back: poses world to camera, metres, and the seconds its calibration took."""
+    """What a peer hands back: poses world to camera, metres, the seconds its calibration took, and what it says of it."""
 
     rotations: Array
     """(C, 3, 3)"""
@@ -59,6 +59,7 @@ class Found(NamedTuple):
     """(C, 3)"""
     seconds: float
     """wall time from keypoints in the peer's own form to poses in metres"""
+    status: str = "done"
 
 
 Calibrate = Callable[[Session], Found]
@@ -184,4 +185,4 @@ def _serve(calibrate: Calibrate, connection: Connection) -> None:
             connection.send({"seconds": found.seconds, "status": "poses are not finite"})
             continue
         poses = {"rotations": found.rotations.tolist(), "translations": found.translations.tolist()}
-        connection.send({"seconds": found.seconds, "status": "done"} | poses)
+        connection.send({"seconds": found.seconds, "status": found.status} | poses)
