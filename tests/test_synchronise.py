@@ -12,7 +12,7 @@ from torchstickcal.problem import Measurements
 from torchstickcal.simulate import Clocks, Noise, SessionSpec
 from torchstickcal.simulate.regimes import DroppedFrames, FrameRates, Gaps, SelfOcclusion
 from torchstickcal.simulate.session import Assumptions
-from torchstickcal.synchronise import search_offsets, shifted
+from torchstickcal.synchronise import on_common_frames, search_offsets
 from torchstickcal.synchronise.epipolar import Tracks
 
 HARD = (Noise(1.5, missing=0.1, outliers=0.05), SelfOcclusion())
@@ -101,18 +101,67 @@ def numbered(cameras: int, frames: int) -> Observations:
     return Observations(keypoints, torch.eye(3), Stick(0, 1, 1.0), confidence=torch.ones(cameras, frames, 2))
 
 
-def test_shifted_frames_stand_where_the_common_axis_has_them():
-    moved, first = shifted(numbered(3, 5), torch.tensor([0, 2, -3]))
-    assert first == 0
-    assert moved.num_frames == 5
+def test_frames_stand_where_the_common_axis_has_them():
+    found = on_common_frames(numbered(3, 5), torch.tensor([0, 2.25, -3]))
+    moved = found.observations
+    assert (found.first, moved.num_frames) == (0, 5)
     frames = moved.keypoints[:, :, 0, 1]
     nan = torch.nan
     expected = torch.tensor([[0, 1, 2, 3, 4], [nan, nan, 0, 1, 2], [3, 4, nan, nan, nan]]).double()
     torch.testing.assert_close(frames, expected, equal_nan=True)
+    assert torch.equal(found.lags[1], torch.tensor([0, 0, 0.25, 0.25, 0.25]).double())
+    assert torch.equal(found.index[1], torch.tensor([2, 3, 4, -1, -1]))
     assert moved.confidence is not None
     assert torch.equal(moved.visible, moved.confidence > 0)
+    back = found.to_own(moved.keypoints, torch.nan)
+    kept = found.index >= 0
+    assert torch.equal(back[kept], numbered(3, 5).keypoints[kept])
+    assert bool(back[~kept].isnan().all())
+
+
+def test_sessions_in_step_are_left_as_they_are():
+    given = numbered(2, 5)
+    found = on_common_frames(given)
+    assert found.observations is given
+    assert bool((found.lags == 0).all())
+
+
+def test_cameras_of_different_rates_and_dropped_frames_meet_by_their_timestamps():
+    nan = torch.nan
+    times = torch.tensor(
+        [[0, 0.02, 0.04, 0.06, 0.08, 0.10], [0.001, 0.041, 0.081, nan, nan, nan], [0, 0.02, nan, 0.06, 0.08, 0.1]]
+    )
+    given = numbered(3, 6)
+    gone = given.keypoints.where(times.isfinite()[..., None, None], nan)
+    found = on_common_frames(replace(given, keypoints=gone, timestamps=times.double()))
+    assert found.rate_hz == pytest.approx(50)
+    frames = found.observations.keypoints[:, :, 0, 1]
+    expected = torch.tensor([[0, 1, 2, 3, 4, 5], [0, nan, 1, nan, 2, nan], [0, 1, nan, 3, 4, 5]]).double()
+    torch.testing.assert_close(frames, expected, equal_nan=True)
+    torch.testing.assert_close(found.lags[1, ::2], torch.full((3,), 0.05, dtype=torch.float64), rtol=1e-5, atol=0)
+
+
+def test_of_two_frames_at_one_common_frame_the_nearer_stays():
+    times = torch.tensor([[0, 0.02, 0.04], [0.001, 0.016, 0.04]]).double()
+    found = on_common_frames(replace(numbered(2, 3), timestamps=times, fps=50.0))
+    assert found.index.tolist() == [[0, 1, 2], [0, 1, 2]]
+    times = torch.tensor([[0, 0.02, 0.04], [0.013, 0.022, 0.04]]).double()
+    assert on_common_frames(replace(numbered(2, 3), timestamps=times, fps=50.0)).index.tolist() == [[-1, 0, 1], [-1, 0, 1]]
 
 
 def test_sessions_without_a_common_frame_are_refused():
     with pytest.raises(ObservationError, match="no two cameras have a frame in common"):
-        shifted(numbered(2, 5), torch.tensor([0, 5]))
+        on_common_frames(numbered(2, 5), torch.tensor([0, 5]))
+
+
+@pytest.mark.parametrize(
+    ("times", "message"),
+    [
+        ([[0, 1, 2]], "wrong shape"),
+        ([[0.0, 2.0, 1.0], [0.0, 1.0, 2.0]], "do not increase"),
+        ([[0.0, 1.0, 2.0], [0.0, 1.0, float("nan")]], "a frame without a timestamp"),
+    ],
+)
+def test_timestamps_that_do_not_fit_are_refused(times: list[list[float]], message: str):
+    with pytest.raises(ObservationError, match=message):
+        replace(numbered(2, 3), timestamps=times)

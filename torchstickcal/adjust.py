@@ -24,6 +24,11 @@ from torchstickcal.uncertainty import camera_covariance, point_variances
 
 _CLOCK_STAGE = "clocks"
 _MAX_CLOCK_ROUNDS = 10
+_MAX_STARTS = 3
+_FITTING_SHARE, _FITTING_FOCAL_SHARE = 0.9, 0.01
+"""Least share of the keypoints that agree, and largest noise over the focal length, where the cameras fit together."""
+_FAR_FRAMES = 0.75
+"""Offset from where a camera's frames were placed from which on others are nearer."""
 _MOVED_SHARE, _MOVED_SIGMAS = 0.9, 0.01
 """The clocks have converged when this share of the keypoints has moved by less than so many standard deviations."""
 
@@ -53,9 +58,31 @@ class Adjustment:
         return all(record.stop.converged for record in self.records)
 
     @property
+    def fits(self) -> bool:
+        """Whether the cameras agree as those of one scene do, with detectors of any use."""
+        share = self.result.inliers.sum() / self.measurements.visible.sum()
+        noise = self.result.sigma_px.median() / self.measurements.cameras.focal_px.mean()
+        return self.converged and float(share) > _FITTING_SHARE and float(noise) < _FITTING_FOCAL_SHARE
+
+    @property
     def median_residual(self) -> float:
         """Median squared residual of all keypoints, square pixels."""
         return float(self.measurements.squared_residuals(self.result.state)[self.measurements.visible].median())
+
+    @property
+    def late_frames(self) -> Tensor:
+        """(C,), how much later than at :attr:`frames` the cameras were found to look, frames."""
+        nothing = torch.zeros_like(self.frames.offsets_frames)
+        return self.found.get("time_offset", nothing)
+
+    @property
+    def found(self) -> dict[str, Tensor]:
+        """Each camera's value (C,) of what else was unknown of it, by kind."""
+        unknowns, values = self.measurements.unknowns, self.result.state.unknowns
+        if unknowns is None or values is None:
+            return {}
+        own = unknowns.by_camera(values)[0].unbind(-1)
+        return {kind.name: value for kind, value in zip(unknowns.kinds, own, strict=True)}
 
     def covariance(self, sigma_px: Tensor) -> Tensor | None:
         """That of the cameras where they were adjusted, for a noise (1, P) of the points' keypoints."""
@@ -116,6 +143,15 @@ class Adjuster:
         Raises:
             RigError: if the cameras cannot be placed in one rig.
         """
+        adjustment = self._begin(refined, offsets_frames)
+        for _ in range(_MAX_STARTS - 1):
+            if not bool((adjustment.late_frames.abs() > _FAR_FRAMES).any()):
+                break
+            adjustment = self._begin(refined, adjustment.frames.offsets_frames + adjustment.late_frames)
+        return adjustment
+
+    def _begin(self, refined: Sequence[str], offsets_frames: Tensor | None) -> Adjustment:
+        """Initialised with the cameras' frames side by side at some offsets, and adjusted."""
         began = time.perf_counter()
         frames = on_common_frames(self._observations, offsets_frames)
         seen, given = self._seen(frames), self._observations

@@ -9,7 +9,6 @@ from torch import Tensor
 
 from torchstickcal.adjust import Adjustment
 from torchstickcal.camera_check import CameraCheck
-from torchstickcal.camera_unknowns import CameraUnknowns
 from torchstickcal.observations import Observations
 from torchstickcal.problem import Measurements
 from torchstickcal.result import LENS_PARAMETERS, Calibration
@@ -131,12 +130,11 @@ class _Timing:
 
     def __init__(self, observations: Observations, reached: Adjustment, check: CameraCheck, stds: Mapping[str, Tensor]) -> None:
         self._observations, self._refined, self._frames = observations, reached.refined, reached.frames
-        frames, unknowns, values = reached.frames, reached.measurements.unknowns, reached.result.state.unknowns
+        frames, found = reached.frames, reached.found
         self._period_s = 1 / frames.rate_hz if frames.rate_hz is not None else torch.nan
         nothing = torch.zeros_like(frames.offsets_frames)
-        own = {} if unknowns is None or values is None else _by_kind(unknowns, values)
-        self.readout = (observations.readout_s or 0.0) + self._seconds(own.get("readout", nothing))
-        middle = self._seconds(frames.offsets_frames + own.get("time_offset", nothing))
+        self.readout = (observations.readout_s or 0.0) + self._seconds(found.get("readout", nothing))
+        middle = self._seconds(frames.offsets_frames + reached.late_frames)
         self.offsets = middle - (self.readout - self.readout[0]) / 2
         self.offsets_std = self._seconds(stds.get("time_offset", nothing))
         self.readout_std = self._seconds(stds.get("readout", nothing))
@@ -166,11 +164,6 @@ class _Timing:
 
     def _seconds(self, frames: Tensor) -> Tensor:
         return torch.where(frames == 0, 0.0, frames * self._period_s)
-
-
-def _by_kind(unknowns: CameraUnknowns, values: Tensor) -> dict[str, Tensor]:
-    """Each camera's own values (C,), by kind."""
-    return {kind.name: own for kind, own in zip(unknowns.kinds, unknowns.by_camera(values)[0].unbind(-1), strict=True)}
 
 
 def _lens_warnings(observations: Observations, ratio: Tensor, std: Tensor, found: Tensor) -> list[str]:

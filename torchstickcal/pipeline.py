@@ -83,8 +83,8 @@ def _calibrated(observations: Observations, settings: Config, callback: Callback
 def _synchronised(adjuster: Adjuster, settings: Config) -> tuple[Adjustment, ClockEstimate | None]:
     """The session adjusted with the unknowns that the configuration names, and what a search for the clocks has found.
 
-    The clocks are searched for where they may differ and the cameras do not fit together as told; what the search finds is
-    taken if the views then agree better.
+    The clocks are searched for where they may differ and the cameras do not fit together as told, or the data say so; what the
+    search finds is taken if the views then agree better.
 
     Raises:
         RigError: if the cameras cannot be placed in one rig.
@@ -95,7 +95,7 @@ def _synchronised(adjuster: Adjuster, settings: Config) -> tuple[Adjustment, Clo
     clocks: ClockEstimate | None = None
     try:
         adjusted = adjuster.begin(lenses)
-        doubted = searchable and adjuster.check(adjusted).gain(("time_offset",)) > 0
+        doubted = searchable and not (adjusted.fits and adjuster.check(adjusted).gain(("time_offset",)) <= 0)
     except RigError:
         if not searchable:
             raise
@@ -103,7 +103,7 @@ def _synchronised(adjuster: Adjuster, settings: Config) -> tuple[Adjustment, Clo
     if doubted:
         clocks = adjuster.search()
         if adjusted is None or bool((clocks.offsets_frames.abs() >= _SEARCHED_FRAMES).any()):
-            moved = adjuster.begin(refined, clocks.offsets_frames)
+            moved = adjuster.begin(with_refinements(refined, ("time_offset",)), clocks.offsets_frames)
             if adjusted is None or moved.median_residual < adjusted.median_residual:
                 return moved, clocks
     assert adjusted is not None
