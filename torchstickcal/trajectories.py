@@ -20,7 +20,8 @@ _DEGREES = 2 * _REACHES[0] + 1
 _RIDGE = 1e-9
 _LEAST_PIVOT = 0.05
 """Share of a basis polynomial that lower degrees leave at the known frames, below which the frames do not determine it."""
-_ROUGH_DEGREES = 3
+_SMOOTH_DEGREES, _ROUGH_DEGREES = 2, 3
+"""The lowest degrees count as motion whatever their size, the highest as a sign of more between the frames."""
 _CHANCE = 2.0
 """Standard deviations of the residual beyond its mean up to which a polynomial follows the motion."""
 _INTERPOLATION_SHARE = 0.15
@@ -97,9 +98,9 @@ class Trajectories:
         noise = torch.arange(3 * _DEGREES, 0, -3).to(basis) / most
         chance = noise + (2 * noise / most).sqrt()
         shrinkage = (1 - chance / energies.clamp_min(1e-300)).clamp_min(0.0)
-        shrinkage[:, :2] = 1.0
+        shrinkage[:, :_SMOOTH_DEGREES] = 1.0
         smooth = torch.linalg.solve_triangular(lower.mT, coefficients * shrinkage[..., None], upper=True)
-        highest = (determined.sum(1, keepdim=True) - _ROUGH_DEGREES).clamp_min(0)
+        highest = (determined.sum(1, keepdim=True) - _ROUGH_DEGREES).clamp_min(_SMOOTH_DEGREES)
         roughness = (energies - noise).gather(1, highest)[:, 0].clamp_min(0.0).sqrt()
         freedom = 3 * ((weights > 0).sum(1) - determined.sum(1)).clamp_min(0)
         unexplained = ((points.square().sum(1) * weights).sum(1) - energies[:, 0]) * most[:, 0]
