@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import torch
 from torch import Tensor
@@ -25,6 +25,7 @@ from torchstickcal.uncertainty import camera_covariance, point_variances
 _CLOCK_STAGE = "clocks"
 _MAX_CLOCK_ROUNDS = 10
 _MAX_STARTS = 3
+_CHECKED_FRAMES = 5000
 _FITTING_SHARE, _FITTING_FOCAL_SHARE = 0.9, 0.01
 """Least share of the keypoints that agree, and largest noise over the focal length, where the cameras fit together."""
 _FAR_FRAMES = 0.75
@@ -46,6 +47,35 @@ class Adjustment:
     """what is found of the cameras beside their poses"""
     result: StageResult
     records: tuple[StageRecord, ...]
+    window: slice = field(default_factory=lambda: slice(None))
+    """which of the common frames this is about"""
+
+    def within(self, most_frames: int) -> Adjustment:
+        """Cut down to the middle of a session that is longer."""
+        total = self.measurements.frames
+        if total <= most_frames:
+            return self
+        start = (total - most_frames) // 2
+        window = slice(start, start + most_frames)
+        columns, result = self.measurements.columns_of(window), self.result
+        state = replace(result.state, points=result.state.points[..., columns])
+        return replace(
+            self,
+            seen=self.seen.within(window),
+            measurements=self.measurements.within(window),
+            result=result._replace(state=state, inliers=result.inliers[..., columns]),
+            window=window,
+        )
+
+    @property
+    def exposures(self) -> Exposures:
+        """When the keypoints were exposed, as far as told."""
+        return Exposures.of(self.frames, self.window)
+
+    @property
+    def apart(self) -> bool:
+        """Whether keypoints at one common frame were not, or need not have been, exposed together."""
+        return self.frames.apart or bool(CLOCKS & set(self.refined))
 
     @property
     def kept(self) -> Measurements:
@@ -172,14 +202,14 @@ class Adjuster:
         seen, old = self._refining(adjustment.seen, refined), adjustment.result.state
         state = _starting(seen, old, adjustment.seen.unknowns)
         result = adjustment.result._replace(state=state)
-        measurements, records = Exposures.of(adjustment.frames).resting(seen), list(adjustment.records)
-        if _apart(adjustment):
+        measurements, records = adjustment.exposures.resting(seen), list(adjustment.records)
+        if adjustment.apart:
             measurements = _placed(adjustment, seen, state)
         if set(refined) - set(adjustment.refined) - CLOCKS:
             records = []
             result = self._through(self._adjusting, measurements, state, records)
-        frames = adjustment.frames
-        return self._on_one_clock(Adjustment(frames, seen, measurements, tuple(refined), result, tuple(records)))
+        started = replace(adjustment, seen=seen, measurements=measurements, refined=tuple(refined))
+        return self._on_one_clock(replace(started, result=result, records=tuple(records)))
 
     def held(self, adjustment: Adjustment) -> Adjustment:
         """The stages that follow once the cameras are found."""
@@ -190,16 +220,17 @@ class Adjuster:
         return replace(adjustment, result=result, records=tuple(records))
 
     def check(self, adjustment: Adjustment) -> CameraCheck:
-        """What the data say of lenses and clocks where an adjustment ended."""
-        result = adjustment.result
-        kept = _placed(adjustment, adjustment.seen, result.state).keeping(result.inliers)
+        """What the data say of lenses and clocks where an adjustment ended; of a long session some of the data."""
+        part = adjustment.within(_CHECKED_FRAMES)
+        result = part.result
+        kept = _placed(part, part.seen, result.state).keeping(result.inliers)
         return CameraCheck(kept, result.state, result.sigma_px, adjustment.sigma_length_m, self._settings.camera_groups)
 
     def _on_one_clock(self, adjustment: Adjustment) -> Adjustment:
         """Where keypoints were not exposed together, the last stage again and again, with the keypoints brought to the common
         clock by the motion found so far."""
         last, records = list(self._adjusting.values())[-1], list(adjustment.records)
-        for number in range(_MAX_CLOCK_ROUNDS if _apart(adjustment) else 0):
+        for number in range(_MAX_CLOCK_ROUNDS if adjustment.apart else 0):
             placed = _placed(adjustment, adjustment.seen, adjustment.result.state)
             moved = _movement(placed, adjustment.measurements, adjustment.result)
             adjustment = replace(adjustment, measurements=placed)
@@ -275,16 +306,11 @@ def _starting(seen: Measurements, state: State, before: CameraUnknowns | None = 
     return replace(state, unknowns=seen.unknowns.taken_over(before, state.unknowns))
 
 
-def _apart(adjustment: Adjustment) -> bool:
-    """Whether keypoints at one common frame were not, or need not have been, exposed together."""
-    return Exposures.of(adjustment.frames).apart or bool(CLOCKS & set(adjustment.refined))
-
-
 def _placed(adjustment: Adjustment, seen: Measurements, state: State) -> Measurements:
     """Keypoints as seen, brought to the common clock at a state by the motion that an adjustment has found."""
     result = adjustment.result
     variance = point_variances(adjustment.kept, result.state, result.sigma_px)
-    return Exposures.of(adjustment.frames).placed(seen, state, variance, result.sigma_px)
+    return adjustment.exposures.placed(seen, state, variance, result.sigma_px)
 
 
 def _movement(placed: Measurements, before: Measurements, result: StageResult) -> float:

@@ -259,6 +259,11 @@ class CameraUnknowns:
         """K"""
         return self.share.shape[2]
 
+    @property
+    def clocked(self) -> bool:
+        """Whether clocks are among them."""
+        return any(isinstance(kind, ClockKind) for kind in self.kinds)
+
     def by_camera(self, values: Tensor) -> Tensor:
         """Every camera's own values (B, C, k), of the rig's (B, K)."""
         return torch.einsum("ckj,bj->bck", self.share, values)

@@ -104,6 +104,22 @@ class Measurements:
             motion=self.motion and ImageMotion(*(tensor[sessions] for tensor in self.motion)),
         )
 
+    def within(self, window: slice) -> Measurements:
+        """The measurements of some frames."""
+        columns = self.columns_of(window)
+        return replace(
+            self,
+            pixels=self.pixels[..., columns],
+            confidence=self.confidence[..., columns],
+            frames=len(range(*window.indices(self.frames))),
+            motion=self.motion and self.motion.at(columns),
+        )
+
+    def columns_of(self, window: slice) -> slice:
+        """The columns of some frames, one after another."""
+        start, stop, _ = window.indices(self.frames)
+        return slice(start * self.points_per_frame, stop * self.points_per_frame)
+
     def keeping(self, kept: Tensor) -> Measurements:
         """The measurements without the keypoints outside a mask (B, C, N), and without points left with a single view."""
         confidence = self.confidence * kept

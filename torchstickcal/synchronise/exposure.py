@@ -32,28 +32,22 @@ class Exposures:
     rows: Tensor
 
     @staticmethod
-    def of(frames: CommonFrames) -> Exposures:
-        """Those of a session on its common frames."""
+    def of(frames: CommonFrames, window: slice = slice(None)) -> Exposures:
+        """Those of a session on its common frames, or on some of them."""
         observations = frames.observations
-        size, points = observations.image_size, observations.num_points
-        rows = torch.zeros(observations.keypoints.shape[:3], dtype=torch.float64, device=observations.keypoints.device)
+        size, ordinates = observations.image_size, observations.keypoints[:, window, :, 1].double()
+        rows = torch.zeros_like(ordinates)
         if size is not None:
             height = size.expand(observations.num_cameras, 2)[:, 1].double()
-            rows = observations.keypoints[..., 1].double() / height[:, None, None] - 0.5
-            rows = rows.nan_to_num().clamp(-0.5, 0.5)
-        delays = frames.lags[..., None].expand(-1, -1, points)
+            rows = (ordinates / height[:, None, None] - 0.5).nan_to_num().clamp(-0.5, 0.5)
+        delays = frames.lags[:, window, None].expand(-1, -1, observations.num_points)
         if observations.readout_s is not None and frames.rate_hz is not None:
             delays = delays + observations.readout_s * frames.rate_hz * rows
         return Exposures(delays.flatten(1), rows.flatten(1))
 
-    @property
-    def apart(self) -> bool:
-        """Whether some keypoint was not exposed at its common frame."""
-        return bool((self.delays != 0).any())
-
     def resting(self, measurements: Measurements) -> Measurements:
         """Measurements as if nothing moved: where trajectories are not known yet."""
-        if measurements.unknowns is None:
+        if measurements.unknowns is None or not measurements.unknowns.clocked:
             return measurements
         reckoned = torch.zeros_like(measurements.unknowns.prior_sigma)
         return replace(measurements, motion=self._motion(torch.zeros_like(measurements.pixels), reckoned))

@@ -32,6 +32,11 @@ class CommonFrames:
     rate_hz: float | None
     """common frames per second; None where that is not known"""
 
+    @property
+    def apart(self) -> bool:
+        """Whether keypoints at one common frame were not all exposed together, as far as that was told."""
+        return bool((self.lags != 0).any()) or bool(self.observations.readout_s)
+
     def to_own(self, values: Tensor, fill: float) -> Tensor:
         """Values (C, G, ...) of the common frames at the cameras' own frames, (C, F, ...)."""
         cameras = torch.arange(len(self.index), device=self.index.device)[:, None]
