@@ -194,7 +194,7 @@ def _undetermined(
             found.append(f"{kind.name} stays near what was given, the data hardly tell it: {names}.")
     for camera, reason in enumerate(clocks.reasons if clocks is not None else ()):
         if reason:
-            found.append(f"{observations.camera_label(camera)}: no clock offset beyond a frame was found, {reason}.")
+            found.append(f"{observations.camera_label(camera)}: its clock's offset is not sure, {reason}.")
     return found
 
 

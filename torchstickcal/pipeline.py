@@ -12,7 +12,7 @@ from torchstickcal.assemble import assemble
 from torchstickcal.camera_check import with_refinements
 from torchstickcal.camera_unknowns import CLOCKS
 from torchstickcal.config import Config, Refine, load_config, with_refine
-from torchstickcal.errors import RigError
+from torchstickcal.errors import ObservationError, RigError
 from torchstickcal.observations import Observations
 from torchstickcal.result import Calibration
 from torchstickcal.solvers import IterationRecord, unheard
@@ -102,12 +102,28 @@ def _synchronised(adjuster: Adjuster, settings: Config) -> tuple[Adjustment, Clo
         adjusted, doubted = None, True
     if doubted:
         clocks = adjuster.search()
-        if adjusted is None or bool((clocks.offsets_frames.abs() >= _SEARCHED_FRAMES).any()):
-            moved = adjuster.begin(with_refinements(refined, ("time_offset",)), clocks.offsets_frames)
-            if adjusted is None or moved.median_residual < adjusted.median_residual:
-                return moved, clocks
+        moved = _moved(adjuster, with_refinements(refined, ("time_offset",)), clocks, needed=adjusted is None)
+        if moved is not None and (adjusted is None or moved.median_residual < adjusted.median_residual):
+            return moved, clocks
     assert adjusted is not None
     return adjuster.again(adjusted, refined) if refined != lenses else adjusted, clocks
+
+
+def _moved(adjuster: Adjuster, refined: Sequence[str], clocks: ClockEstimate, needed: bool) -> Adjustment | None:
+    """The session adjusted at the offsets that a search has found, where these are others than those told, or it is needed.
+
+    Where some are not sure, the likeliest and those told are tried; the views decide.
+    """
+    tried = [clocks.likeliest_frames, *([] if all(clocks.determined) else [clocks.offsets_frames])]
+    found: list[Adjustment] = []
+    for offsets in tried:
+        if needed or bool((offsets.abs() >= _SEARCHED_FRAMES).any()):
+            try:
+                found.append(adjuster.begin(refined, offsets))
+            except (RigError, ObservationError):
+                if needed and offsets is tried[-1] and not found:
+                    raise
+    return min(found, key=lambda adjustment: adjustment.median_residual, default=None)
 
 
 def _chosen(adjuster: Adjuster, settings: Config, adjusted: Adjustment) -> Adjustment:

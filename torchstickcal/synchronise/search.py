@@ -38,6 +38,8 @@ class ClockEstimate:
 
     offsets_frames: Tensor
     """(C,), float64: camera c's frame f shows what camera 0 shows at its frame ``f + offsets_frames[c]``; 0 where not known"""
+    likeliest_frames: Tensor
+    """(C,), float64: the same, with the likeliest where not known"""
     determined: tuple[bool, ...]
     """whether the motion tells a camera's offset; True for camera 0"""
     reasons: tuple[str, ...]
@@ -64,7 +66,8 @@ def search_offsets(measurements: Measurements, max_offset_frames: float, noise_p
         pairs, gains, offsets = _joint_offsets(tracks, reach, noise_px)
     reasons = _doubts(pairs, gains, offsets, reach)
     determined = tuple(not reason for reason in reasons)
-    return ClockEstimate(_refined(pairs, offsets, determined), determined, reasons)
+    refined = _refined(pairs, offsets, determined)
+    return ClockEstimate(refined, refined.where(torch.tensor(determined), offsets.double()), determined, reasons)
 
 
 def _undistorted(measurements: Measurements) -> tuple[Tensor, Tensor]:
