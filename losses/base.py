@@ -58,6 +58,14 @@ class Loss(nn.Module):
         part.sigma = self.sigma[sessions]
         return part
 
+    def replaced(self, where: Tensor, other: Self) -> Self:
+        """The same loss with the ``sigma`` of some sessions (B,), True where, that of another."""
+        if self.sigma.ndim < 3:
+            return self
+        mixed = copy.deepcopy(self)
+        mixed.sigma = torch.where(where.view(-1, *[1] * (self.sigma.ndim - 1)), other.sigma, self.sigma)
+        return mixed
+
     def information(self, like: Tensor) -> Tensor:
         """1 / sigma^2 in the dtype and on the device of a tensor."""
         return self.sigma.to(like).square().reciprocal()

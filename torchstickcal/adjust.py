@@ -19,19 +19,23 @@ from torchstickcal.observations import Observations
 from torchstickcal.problem import Measurements, State
 from torchstickcal.solvers import Listener
 from torchstickcal.stages import StageRecord, StageResult, rulers, run_stage
-from torchstickcal.synchronise import ClockEstimate, CommonFrames, Exposures, on_common_frames, search_offsets
+from torchstickcal.synchronise import (
+    CLOCK_STAGE,
+    ClockEstimate,
+    CommonFrames,
+    Exposures,
+    on_common_frames,
+    on_one_clock,
+    search_offsets,
+)
 from torchstickcal.uncertainty import camera_covariance, point_variances
 
-_CLOCK_STAGE = "clocks"
-_MAX_CLOCK_ROUNDS = 10
 _MAX_STARTS = 3
 _CHECKED_FRAMES = 5000
 _FITTING_SHARE, _FITTING_FOCAL_SHARE = 0.9, 0.01
 """Least share of the keypoints that agree, and largest noise over the focal length, where the cameras fit together."""
 _FAR_FRAMES = 0.75
 """Offset from where a camera's frames were placed from which on others are nearer."""
-_MOVED_SHARE, _MOVED_SIGMAS = 0.9, 0.01
-"""The clocks have converged when this share of the keypoints has moved by less than so many standard deviations."""
 
 
 @dataclass(frozen=True)
@@ -111,8 +115,7 @@ class Adjustment:
         unknowns, values = self.measurements.unknowns, self.result.state.unknowns
         if unknowns is None or values is None:
             return {}
-        own = unknowns.by_camera(values)[0].unbind(-1)
-        return {kind.name: value for kind, value in zip(unknowns.kinds, own, strict=True)}
+        return {name: own[0] for name, own in unknowns.by_kind(values).items()}
 
     def covariance(self, sigma_px: Tensor) -> Tensor | None:
         """That of the cameras where they were adjusted, for a noise (1, P) of the points' keypoints."""
@@ -227,18 +230,17 @@ class Adjuster:
         return CameraCheck(kept, result.state, result.sigma_px, adjustment.sigma_length_m, self._settings.camera_groups)
 
     def _on_one_clock(self, adjustment: Adjustment) -> Adjustment:
-        """Where keypoints were not exposed together, the last stage again and again, with the keypoints brought to the common
-        clock by the motion found so far."""
+        """Where keypoints were not exposed together, the last stage on the common clock."""
+        if not adjustment.apart:
+            return adjustment
         last, records = list(self._adjusting.values())[-1], list(adjustment.records)
-        for number in range(_MAX_CLOCK_ROUNDS if adjustment.apart else 0):
-            placed = _placed(adjustment, adjustment.seen, adjustment.result.state)
-            moved = _movement(placed, adjustment.measurements, adjustment.result)
-            adjustment = replace(adjustment, measurements=placed)
-            if number > 0 and moved < _MOVED_SIGMAS:
-                break
-            result = self._run(_CLOCK_STAGE, last, placed, adjustment.result.state, records)
-            adjustment = replace(adjustment, result=result, records=tuple(records))
-        return adjustment
+
+        def run(placed: Measurements, state: State) -> StageResult:
+            return self._run(CLOCK_STAGE, last, placed, state, records)
+
+        ended = adjustment.measurements, adjustment.result
+        placed, result = on_one_clock(adjustment.seen, adjustment.exposures, *ended, run)
+        return replace(adjustment, measurements=placed, result=result, records=tuple(records))
 
     def _through(
         self, stages: Mapping[str, Stage], measurements: Measurements, state: State, records: list[StageRecord]
@@ -311,10 +313,3 @@ def _placed(adjustment: Adjustment, seen: Measurements, state: State) -> Measure
     result = adjustment.result
     variance = point_variances(adjustment.kept, result.state, result.sigma_px)
     return adjustment.exposures.placed(seen, state, variance, result.sigma_px)
-
-
-def _movement(placed: Measurements, before: Measurements, result: StageResult) -> float:
-    """Distance that most keypoints moved since they were placed before, in standard deviations of their noise."""
-    moved = (placed.pixels_at(result.state) - before.pixels_at(result.state)).square().sum(-2).sqrt()
-    sigmas = (before.by_frame(moved) / result.sigma_px[:, None, None])[before.by_frame(result.inliers)]
-    return float(sigmas.kthvalue(max(1, int(_MOVED_SHARE * len(sigmas)))).values)

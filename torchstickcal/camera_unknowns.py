@@ -250,6 +250,11 @@ class CameraUnknowns:
             priors.append(kinds[kind].prior(cameras)[..., sharing].mean(-1))
         return CameraUnknowns(tuple(kinds), share, torch.stack(priors, dim=-1))
 
+    @staticmethod
+    def stack(sessions: Sequence[CameraUnknowns]) -> CameraUnknowns:
+        """The same unknowns in several sessions as those of one batch."""
+        return replace(sessions[0], prior_sigma=torch.cat([session.prior_sigma for session in sessions]))
+
     def __getitem__(self, sessions: slice | list[int]) -> CameraUnknowns:
         """Those of some of the sessions."""
         return replace(self, prior_sigma=self.prior_sigma[sessions])
@@ -268,9 +273,13 @@ class CameraUnknowns:
         """Every camera's own values (B, C, k), of the rig's (B, K)."""
         return torch.einsum("ckj,bj->bck", self.share, values)
 
+    def by_kind(self, values: Tensor) -> dict[str, Tensor]:
+        """Every camera's own values (B, C) by the name of the kind, of the rig's (B, K)."""
+        return dict(zip((kind.name for kind in self.kinds), self.by_camera(values).unbind(-1), strict=True))
+
     def taken_over(self, others: CameraUnknowns, values: Tensor) -> Tensor:
         """Values (B, K) that are those of others (B, K') where these know the kind, else zero; shared ones are means."""
-        by_kind = dict(zip((kind.name for kind in others.kinds), others.by_camera(values).unbind(-1), strict=True))
+        by_kind = others.by_kind(values)
         nothing = values.new_zeros(len(values), len(self.share))
         own = torch.stack([by_kind.get(kind.name, nothing) for kind in self.kinds], dim=-1)
         return torch.einsum("ckj,bck->bj", self.share, own) / self.share.sum((0, 1))

@@ -76,7 +76,7 @@ class Measurements:
 
     @staticmethod
     def stack(sessions: Sequence[Measurements]) -> Measurements:
-        """Sessions of equal shape and with the same sticks as one batch."""
+        """Sessions of equal shape, with the same sticks and the same unknowns, as one batch."""
         if len(sessions) == 1:
             return sessions[0]
         first = sessions[0]
@@ -90,7 +90,18 @@ class Measurements:
         pixels, confidence, lengths_m = (
             torch.cat([getattr(session, name) for session in sessions]) for name in ("pixels", "confidence", "lengths_m")
         )
-        return Measurements(pixels, confidence, cameras, first.frames, first.pairs, lengths_m)
+        unknowns = [session.unknowns for session in sessions if session.unknowns is not None]
+        motions = [session.motion for session in sessions if session.motion is not None]
+        return Measurements(
+            pixels,
+            confidence,
+            cameras,
+            first.frames,
+            first.pairs,
+            lengths_m,
+            CameraUnknowns.stack(unknowns) if unknowns else None,
+            ImageMotion(*map(torch.cat, zip(*motions, strict=True))) if motions else None,
+        )
 
     def __getitem__(self, sessions: slice) -> Measurements:
         """Some of the sessions."""

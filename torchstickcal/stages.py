@@ -133,6 +133,18 @@ class StageResult(NamedTuple):
     records: tuple[StageRecord, ...]
     """one for each session"""
 
+    def replaced(self, where: Tensor, other: StageResult) -> StageResult:
+        """The result with some sessions (B,), True where, taken from another of the same stage."""
+        return StageResult(
+            self.state.replaced(where, other.state),
+            self.minimum.replaced(where, other.minimum),
+            {name: loss.replaced(where, other.losses[name]) for name, loss in self.losses.items()},
+            torch.where(where[:, None, None], other.inliers, self.inliers),
+            torch.where(where[:, None], other.sigma_px, self.sigma_px),
+            self.cameras_free,
+            tuple(new if taken else old for old, new, taken in zip(self.records, other.records, where.tolist(), strict=True)),
+        )
+
 
 def run_stage(
     name: str,

@@ -2,8 +2,17 @@
 
 from __future__ import annotations
 
+from torchstickcal.synchronise.common_clock import CLOCK_STAGE, on_one_clock
 from torchstickcal.synchronise.exposure import Exposures
 from torchstickcal.synchronise.frames import CommonFrames, on_common_frames
 from torchstickcal.synchronise.search import ClockEstimate, search_offsets
 
-__all__ = ["ClockEstimate", "CommonFrames", "Exposures", "on_common_frames", "search_offsets"]
+__all__ = [
+    "CLOCK_STAGE",
+    "ClockEstimate",
+    "CommonFrames",
+    "Exposures",
+    "on_common_frames",
+    "on_one_clock",
+    "search_offsets",
+]

@@ -21,11 +21,11 @@ from torchstickcal.trajectories import Trajectories
 
 @dataclass(frozen=True)
 class Exposures:
-    """When the keypoints of one session were exposed.
+    """When the keypoints of B sessions were exposed.
 
     Args:
-        delays: (C, N), frames after the common frame that they stand at, as far as that was told.
-        rows: (C, N), how far below the middle row they are, as shares of the image's height; zero where that is not known.
+        delays: (B, C, N), frames after the common frame that they stand at, as far as that was told.
+        rows: (B, C, N), how far below the middle row they are, as shares of the image's height; zero where that is not known.
     """
 
     delays: Tensor
@@ -35,15 +35,30 @@ class Exposures:
     def of(frames: CommonFrames, window: slice = slice(None)) -> Exposures:
         """Those of a session on its common frames, or on some of them."""
         observations = frames.observations
-        size, ordinates = observations.image_size, observations.keypoints[:, window, :, 1].double()
-        rows = torch.zeros_like(ordinates)
-        if size is not None:
-            height = size.expand(observations.num_cameras, 2)[:, 1].double()
-            rows = (ordinates / height[:, None, None] - 0.5).nan_to_num().clamp(-0.5, 0.5)
-        delays = frames.lags[:, window, None].expand(-1, -1, observations.num_points)
+        told = Exposures.together(observations.keypoints[None, :, window], observations.image_size)
+        delays = frames.lags[None, :, window, None].expand(-1, -1, -1, observations.num_points).flatten(2)
         if observations.readout_s is not None and frames.rate_hz is not None:
-            delays = delays + observations.readout_s * frames.rate_hz * rows
-        return Exposures(delays.flatten(1), rows.flatten(1))
+            delays = delays + observations.readout_s * frames.rate_hz * told.rows
+        return replace(told, delays=delays)
+
+    @staticmethod
+    def together(keypoints: Tensor, image_size: Tensor | None) -> Exposures:
+        """Those of keypoints whose middle rows were exposed at the common frames, as far as told.
+
+        Args:
+            keypoints: (B, C, F, P, 2), pixels, NaN where not seen.
+            image_size: (2,), (C, 2) or (B, C, 2), width and height, pixels; None where that is not known.
+        """
+        ordinates = keypoints[..., 1].double()
+        rows = torch.zeros_like(ordinates)
+        if image_size is not None:
+            height = image_size.expand(*keypoints.shape[:2], 2)[..., 1].double()
+            rows = (ordinates / height[..., None, None] - 0.5).nan_to_num().clamp(-0.5, 0.5)
+        return Exposures(torch.zeros_like(rows).flatten(2), rows.flatten(2))
+
+    def __getitem__(self, sessions: slice | list[int]) -> Exposures:
+        """Those of some of the sessions."""
+        return Exposures(self.delays[sessions], self.rows[sessions])
 
     def resting(self, measurements: Measurements) -> Measurements:
         """Measurements as if nothing moved: where trajectories are not known yet."""
@@ -56,34 +71,36 @@ class Exposures:
         """Measurements with their keypoints moved to the common frames, and less weight where the motion between is not known.
 
         Args:
-            measurements: one session as seen.
+            measurements: the sessions as seen.
             state: the cameras, points and unknowns at which to place them.
-            variance: of the points along an axis, (1, N), square metres; infinite where a point is not known.
-            sigma_px: noise of each point's keypoints, (1, P).
+            variance: of the points along an axis, (B, N), square metres; infinite where a point is not known.
+            sigma_px: noise of each point's keypoints, (B, P).
         """
         m, unknowns = measurements, measurements.unknowns
         delays = self.delays
         if unknowns is not None and state.unknowns is not None:
-            delays = delays + unknowns.delays(self.rows[None], state.unknowns)[0]
-        trajectories = Trajectories(m.by_frame(state.points)[0], m.by_frame(variance)[0])
-        cameras = m.cameras_at(state).to(torch.float64)[0]
-        pose = state.rotations[0], state.translations[0]
+            delays = delays + unknowns.delays(self.rows, state.unknowns)
+        every_camera = m.cameras_at(state).to(torch.float64)
         pixels, velocity, confidence = m.pixels.clone(), torch.empty_like(m.pixels), m.confidence.clone()
-        for columns, frames in zip(m.chunks(), m.frame_slices(), strict=True):
-            pieces, delay = trajectories.pieces(frames), delays[:, columns]
-            late, depth, moving = _seen(cameras, pose, pieces.positions(delay), pieces.velocities(delay))
-            x, y, z = _in_cameras(pose, pieces.positions(torch.zeros_like(delay))).unbind(1)
-            moved = late - torch.stack(cameras.project_components(x, y, z), dim=1)
-            pixels[0, ..., columns] -= moved.where(((depth > 0) & (z > 0))[:, None], 0.0).to(pixels.dtype)
-            velocity[0, ..., columns] = moving.where((depth > 0)[:, None], 0.0).to(pixels.dtype)
-            deviation = pieces.deviations_m(delay) * cameras.focal_px[:, None] * depth
-            variance_ratio = (deviation / sigma_px[0].repeat(frames.stop - frames.start)).square()
-            confidence[0, :, columns] /= 1 + confidence[0, :, columns] * variance_ratio.to(pixels.dtype)
-        reckoned = torch.zeros(1, 0).to(state.points) if state.unknowns is None else state.unknowns
+        for session in range(m.sessions):
+            trajectories = Trajectories(m.by_frame(state.points[session]), m.by_frame(variance[session]))
+            cameras, pose = every_camera[session], (state.rotations[session], state.translations[session])
+            for columns, frames in zip(m.chunks(), m.frame_slices(), strict=True):
+                pieces, delay = trajectories.pieces(frames), delays[session, :, columns]
+                late, depth, moving = _seen(cameras, pose, pieces.positions(delay), pieces.velocities(delay))
+                x, y, z = _in_cameras(pose, pieces.positions(torch.zeros_like(delay))).unbind(1)
+                moved = late - torch.stack(cameras.project_components(x, y, z), dim=1)
+                pixels[session, ..., columns] -= moved.where(((depth > 0) & (z > 0))[:, None], 0.0).to(pixels.dtype)
+                velocity[session, ..., columns] = moving.where((depth > 0)[:, None], 0.0).to(pixels.dtype)
+                deviation = pieces.deviations_m(delay) * cameras.focal_px[:, None] * depth
+                variance_ratio = (deviation / sigma_px[session].repeat(frames.stop - frames.start)).square()
+                weights = confidence[session, :, columns]
+                weights /= 1 + weights * variance_ratio.to(pixels.dtype)
+        reckoned = torch.zeros(m.sessions, 0).to(state.points) if state.unknowns is None else state.unknowns
         return replace(m, pixels=pixels, confidence=confidence, motion=self._motion(velocity, reckoned))
 
     def _motion(self, velocity: Tensor, reckoned: Tensor) -> ImageMotion:
-        return ImageMotion(velocity, self.rows[None].to(velocity), reckoned)
+        return ImageMotion(velocity, self.rows.to(velocity), reckoned)
 
 
 def _seen(
