@@ -11,14 +11,12 @@ from torch import Tensor
 
 from torchstickcal import (
     CalibrationLayer,
-    Config,
     ConfigError,
     GaussNewton,
     Intrinsics,
     ObservationError,
     Unrolled,
     calibrate,
-    load_config,
 )
 from torchstickcal.layer import LayerResult
 from torchstickcal.simulate import Noise, golf_session
@@ -182,8 +180,5 @@ def test_lenses_not_refined_are_passed_on():
 def test_what_has_no_gradient_and_groups_that_do_not_fit_are_refused():
     with pytest.raises(ConfigError, match="does not choose what to refine"):
         CalibrationLayer(STICK, {"extends": "default", "refine": "auto"})
-    for clock in ("time_offset", "readout"):
-        with pytest.raises(ConfigError, match="takes clocks as given"):
-            CalibrationLayer(STICK, Config(load_config().stages, refine=[clock]))  # pyright: ignore[reportArgumentType]
     with pytest.raises(ConfigError, match="camera groups do not fit"):
         CalibrationLayer(STICK, config("focal_shared") | {"camera_groups": ["a"]})(OBSERVATIONS.keypoints, inputs().matrix)

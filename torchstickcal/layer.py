@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -11,7 +12,7 @@ import torch
 from torch import Tensor, nn
 
 from torchstickcal.adjust import points_used
-from torchstickcal.camera_unknowns import CLOCKS, CameraUnknowns
+from torchstickcal.camera_unknowns import CameraUnknowns
 from torchstickcal.cameras import Intrinsics
 from torchstickcal.config import Config, Stage, load_config
 from torchstickcal.errors import CalibrationError, ConfigError, ObservationError
@@ -23,6 +24,8 @@ from torchstickcal.problem import Measurements, State
 from torchstickcal.solvers import unheard
 from torchstickcal.solvers.newton import polish
 from torchstickcal.stages import Ruler, StageResult, rulers, run_stage, scale_factors
+from torchstickcal.synchronise import CLOCK_STAGE, Exposures, on_one_clock
+from torchstickcal.uncertainty import point_variances
 from torchstickcal.workers import map_on_workers
 
 _KEYPOINTS_AT_ONCE = 32_000
@@ -33,7 +36,7 @@ _KEYPOINTS_AT_ONCE = 32_000
 class LayerResult:
     """Calibrated rigs, in the frame of each session's first camera; leading B only where the keypoints had it.
 
-    Poses, lenses and points carry gradients, and have the dtype and device of the keypoints.
+    Poses, lenses, clocks and points carry gradients, and have the dtype and device of the keypoints.
     """
 
     rotations: Tensor
@@ -44,8 +47,13 @@ class LayerResult:
     """(B, C, 3, 3), pixels, with what the configuration refines as found; as given where a session could not be calibrated"""
     distortion: Tensor | None
     """(B, C, D), likewise; None for perfect lenses"""
+    time_offsets: Tensor
+    """(B, C), how much later than the first camera's a camera's frames are exposed in their middle row, frames; zero where the
+    configuration does not refine it"""
+    readout: Tensor
+    """(B, C), time from the first row of an image to the last, frames; likewise"""
     unknowns: Tensor
-    """(B, K), how the lenses differ from those given, as :class:`torchstickcal.camera_unknowns.CameraUnknowns` has it"""
+    """(B, K), how lenses and clocks differ from those given, as :class:`torchstickcal.camera_unknowns.CameraUnknowns` has it"""
     points: Tensor
     """(B, F, P, 3), metres; zero where ``known`` is False"""
     known: Tensor
@@ -63,8 +71,13 @@ class LayerResult:
 class CalibrationLayer(nn.Module):
     """From keypoints to cameras and points in metres, with gradients back to keypoints, confidence, intrinsics and lengths.
 
-    Where the configuration refines lenses, those given are where they are found from. The noise of the keypoints and the choice
-    of outliers, where the configuration estimates them, count as constants.
+    Where the configuration refines lenses, those given are where they are found from. Where it refines clocks, frames that
+    stand side by side are taken to be of about the same time: offsets of up to about a frame are found, and whole frames are
+    not searched for.
+
+    The noise of the keypoints and the choice of outliers, where the configuration estimates them, count as constants. So does
+    the motion by which keypoints are brought to one clock: how far each is moved to where the clocks were found, its velocity
+    in the image, and the weight that it loses to interpolation. What else a clock depends on, its gradient has.
 
     Args:
         sticks: the stick or sticks, as of :class:`Observations`.
@@ -72,7 +85,7 @@ class CalibrationLayer(nn.Module):
         gradient: ``implicit`` (exact), ``gauss_newton`` (approximate), ``unrolled``, or a :class:`GradientMode`.
 
     Raises:
-        ConfigError: for an unusable configuration, or one that refines clocks or chooses what to refine.
+        ConfigError: for an unusable configuration, or one that chooses what to refine.
     """
 
     def __init__(
@@ -84,7 +97,7 @@ class CalibrationLayer(nn.Module):
         super().__init__()
         self.sticks = (sticks,) if isinstance(sticks, Stick) else tuple(sticks)
         self.config = load_config(config)
-        self._refined = _lenses(self.config)
+        self._refined = _refined(self.config)
         self.gradient = gradient_mode(gradient)
 
     def forward(
@@ -94,6 +107,7 @@ class CalibrationLayer(nn.Module):
         stick_lengths: Tensor | None = None,
         confidence: Tensor | None = None,
         initial: LayerResult | None = None,
+        image_size: Tensor | Sequence[int] | None = None,
     ) -> LayerResult:
         """Calibrate B sessions of equal shape, or one.
 
@@ -104,14 +118,23 @@ class CalibrationLayer(nn.Module):
             confidence: (B, C, F, P) or (C, F, P), in [0, 1].
             initial: an earlier result of this layer to start from, if the keypoints have moved but little since. It saves the
                 initialisation and all stages before the last one that adjusts the cameras.
+            image_size: (2,), (C, 2) or (B, C, 2), width and height, pixels; needed where the configuration refines ``readout``.
 
         Raises:
             ConfigError: if the configuration's camera groups do not fit the cameras.
-            ObservationError: for arguments whose shapes do not fit. A session that cannot be calibrated from is not an error
-                but a status.
+            ObservationError: for arguments whose shapes do not fit, and without an image size where it is needed. A session
+                that cannot be calibrated from is not an error but a status.
         """
         batched = keypoints.ndim == 5
-        given = _Given.of(keypoints if batched else keypoints[None], intrinsics, stick_lengths, confidence, self.sticks)
+        if "readout" in self._refined and image_size is None:
+            raise ObservationError(
+                "a read-out time without what it is counted in",
+                where="image_size",
+                got=None,
+                expected="width and height, (2,), (cameras, 2) or (B, cameras, 2): rows are exposed one after another",
+            )
+        keypoints = keypoints if batched else keypoints[None]
+        given = _Given.of(keypoints, intrinsics, stick_lengths, confidence, image_size, self.sticks)
         if self._refined:
             given = replace(given, unknowns=CameraUnknowns.of(self._refined, given.cameras, self.config.camera_groups))
         if initial is not None and not batched:
@@ -162,35 +185,35 @@ class CalibrationLayer(nn.Module):
     def _begin(self, given: _Given, initial: LayerResult | None, index: int) -> _Begun:
         """A session's measurements and where to start."""
         observations = given.observations(index, self.sticks)
-        measurements = Measurements.of(observations, points_used(observations, self.config))
+        given = given.of_sessions([index])
+        seen = Measurements.of(observations, points_used(observations, self.config))
+        refined = replace(seen, unknowns=given.unknowns)
+        resting = given.exposures.resting(refined)
         settings = self.config.initialise
         if initial is None or not bool(initial.converged[index]):
             labels = [observations.camera_label(camera) for camera in range(observations.num_cameras)]
-            state = replace(initialise(measurements, settings, labels), unknowns=given.nothing_found[index][None])
-            return _Begun(observations, measurements, state)
+            state = replace(initialise(seen, settings, labels), unknowns=given.nothing_found)
+            return _Begun(observations, refined, resting, state)
         rotations, translations, unknowns = (
             v[index][None].detach().double() for v in (initial.rotations, initial.translations, initial.unknowns)
         )
         points = initial.points[index].detach().double().flatten(0, 1).mT[None]
         known = initial.known[index].flatten()
-        if bool((measurements.active[0] & ~known).any()):
-            points = points.where(known, triangulated(measurements, rotations, translations, settings))
-        return _Begun(observations, measurements, State(rotations, translations, points.contiguous(), unknowns))
+        if bool((seen.active[0] & ~known).any()):
+            points = points.where(known, triangulated(seen, rotations, translations, settings))
+        state = State(rotations, translations, points.contiguous(), unknowns)
+        if not given.clocked:
+            return _Begun(observations, refined, resting, state)
+        sigma_px = initial.sigma_px[index][None].detach().double()
+        variance = point_variances(resting.keeping(initial.inliers[index].flatten(1)[None]), state, sigma_px)
+        return _Begun(observations, refined, given.exposures.placed(refined, state, variance, sigma_px), state)
 
     def _solve(self, given: _Given, begun: list[_Begun], warm: bool) -> list[_Solved]:
         """Run the stages on sessions side by side, then tie the last ones to what was given."""
-        stages = list(self.config.stages.items())
-        last_free = max((number for number, (_, stage) in enumerate(stages) if stage.cameras == "free"), default=0)
-        measurements = replace(Measurements.stack([session.measurements for session in begun]), unknowns=given.unknowns)
-        state = State.stack([session.state for session in begun])
         known = rulers([session.observations for session in begun], self.config)
-        reached: list[tuple[Stage, StageResult]] = []
-        with torch.no_grad():
-            for name, stage in stages[last_free if warm else 0 :]:
-                reached.append((stage, run_stage(name, stage, measurements, state, known, self.config.solver, unheard)))
-                state = reached[-1][1].state
-        decisive = reached[last_free - len(stages) :]
-        data = given.measurements(measurements)
+        as_seen = Measurements.stack([session.seen for session in begun])
+        measurements, decisive = self._through(as_seen, given.exposures, begun, known, warm)
+        data = given.measurements(as_seen, measurements)
         tied = self._tied(data, decisive, known)
         last = decisive[-1][1]
         status = [
@@ -202,12 +225,15 @@ class CalibrationLayer(nn.Module):
         dtype = given.keypoints.dtype
         cameras = data.cameras_at(tied).to(dtype)
         assert tied.unknowns is not None
+        time_offsets, readout = given.clocks(tied.unknowns)
         return [
             _Solved(
                 tied.rotations[k].to(dtype),
                 tied.translations[k].to(dtype),
                 cameras.matrix[k],
                 None if cameras.distortion is None else cameras.distortion[k],
+                time_offsets[k].to(dtype),
+                readout[k].to(dtype),
                 tied.unknowns[k].to(dtype),
                 points[k].to(dtype),
                 seen[k],
@@ -218,6 +244,30 @@ class CalibrationLayer(nn.Module):
             )
             for k in range(len(begun))
         ]
+
+    @torch.no_grad()
+    def _through(
+        self, seen: Measurements, exposures: Exposures, begun: list[_Begun], known: Sequence[Ruler], warm: bool
+    ) -> tuple[Measurements, list[tuple[Stage, StageResult]]]:
+        """The keypoints as the stages leave them, on one clock where clocks are to be found, and the results of the last stage
+        that adjusts the cameras and of those after it."""
+        stages = list(self.config.stages.items())
+        last_free = max((number for number, (_, stage) in enumerate(stages) if stage.cameras == "free"), default=0)
+        measurements = Measurements.stack([session.measurements for session in begun])
+        state = State.stack([session.state for session in begun])
+        reached: list[tuple[Stage, StageResult]] = []
+
+        def run(name: str, stage: Stage, measurements: Measurements, state: State) -> StageResult:
+            return run_stage(name, stage, measurements, state, known, self.config.solver, unheard)
+
+        for number, (name, stage) in list(enumerate(stages))[last_free if warm else 0 :]:
+            result = run(name, stage, measurements, state)
+            if number == last_free and measurements.motion is not None:
+                again = partial(run, CLOCK_STAGE, stage)
+                measurements, result = on_one_clock(seen, exposures, measurements, result, again)
+            reached.append((stage, result))
+            state = result.state
+        return measurements, reached[last_free - len(stages) :]
 
     def _tied(self, data: Measurements, decisive: Sequence[tuple[Stage, StageResult]], known: Sequence[Ruler]) -> State:
         """The result of the last stage that adjusts the cameras and of those after it, with gradients by the data."""
@@ -240,7 +290,10 @@ class _Begun(NamedTuple):
     """A session on its way into the solver."""
 
     observations: Observations
+    seen: Measurements
+    """the keypoints as seen"""
     measurements: Measurements
+    """the same, where the clocks are known at the start brought to one"""
     state: State
 
 
@@ -251,6 +304,8 @@ class _Solved(NamedTuple):
     translations: Tensor
     intrinsics: Tensor
     distortion: Tensor | None
+    time_offsets: Tensor
+    readout: Tensor
     unknowns: Tensor
     points: Tensor
     known: Tensor
@@ -279,8 +334,9 @@ class _Given:
     """(B, C, ...), float64"""
     lengths_m: Tensor
     """(B, S), float64"""
+    exposures: Exposures
     unknowns: CameraUnknowns | None = None
-    """what is to be found of the lenses"""
+    """what is to be found of lenses and clocks"""
 
     @staticmethod
     def of(
@@ -288,6 +344,7 @@ class _Given:
         intrinsics: Tensor | Intrinsics,
         stick_lengths: Tensor | None,
         confidence: Tensor | None,
+        image_size: Tensor | Sequence[int] | None,
         sticks: Sequence[Stick],
     ) -> _Given:
         """Arguments of a forward pass, ``keypoints`` (B, C, F, P, 2), checked for their shapes."""
@@ -305,23 +362,43 @@ class _Given:
         distortion = lens.distortion
         if distortion is not None:
             distortion = _expanded("distortion", distortion, (sessions, cameras, distortion.shape[-1]), keypoints)
+        if image_size is not None:
+            image_size = _expanded("image_size", torch.as_tensor(image_size), (sessions, cameras, 2), keypoints)
         return _Given(
             keypoints,
             None if confidence is None else confidence.reshape(keypoints.shape[:-1]),
             Intrinsics(_expanded("intrinsics", lens.matrix, (sessions, cameras, 3, 3), keypoints), distortion, lens.fisheye),
             _expanded("stick_lengths", stick_lengths, (sessions, len(sticks)), keypoints),
+            Exposures.together(keypoints.detach(), image_size),
         )
 
     def of_sessions(self, chosen: list[int]) -> _Given:
         """Some of the sessions."""
         confidence = None if self.confidence is None else self.confidence[chosen]
-        unknowns = self.unknowns and self.unknowns[chosen]
-        return _Given(self.keypoints[chosen], confidence, self.cameras[chosen], self.lengths_m[chosen], unknowns)
+        return _Given(
+            self.keypoints[chosen],
+            confidence,
+            self.cameras[chosen],
+            self.lengths_m[chosen],
+            self.exposures[chosen],
+            self.unknowns and self.unknowns[chosen],
+        )
+
+    @property
+    def clocked(self) -> bool:
+        """Whether clocks are to be found."""
+        return self.unknowns is not None and self.unknowns.clocked
 
     @property
     def nothing_found(self) -> Tensor:
-        """(B, K), the unknowns of lenses as given."""
+        """(B, K), the unknowns of lenses and clocks as given."""
         return self.lengths_m.new_zeros(len(self.lengths_m), 0 if self.unknowns is None else self.unknowns.count)
+
+    def clocks(self, values: Tensor) -> tuple[Tensor, Tensor]:
+        """Time offsets and read-out times (B, C), frames, at values (B, K) of the unknowns."""
+        own = {} if self.unknowns is None else self.unknowns.by_kind(values)
+        nothing = torch.zeros_like(self.cameras.focal_px)
+        return own.get("time_offset", nothing), own.get("readout", nothing)
 
     @torch.no_grad()
     def failed(self, index: int, status: str) -> _Solved:
@@ -331,11 +408,14 @@ class _Given:
         nothing = torch.zeros(cameras, frames, points, dtype=torch.bool, device=like.device)
         lenses = self.cameras if self.unknowns is None else self.unknowns.applied(self.cameras, self.nothing_found)
         lens = lenses[index].to(like.dtype)
+        time_offsets, readout = self.clocks(self.nothing_found)
         return _Solved(
             torch.eye(3).to(like).expand(cameras, 3, 3),
             like.new_zeros(cameras, 3),
             lens.matrix,
             lens.distortion,
+            time_offsets[index].to(like.dtype),
+            readout[index].to(like.dtype),
             self.nothing_found[index].to(like.dtype),
             like.new_zeros(frames, points, 3),
             nothing[0],
@@ -358,17 +438,19 @@ class _Given:
             fisheye=self.cameras.fisheye,
         )
 
-    def measurements(self, solved: Measurements) -> Measurements:
-        """Measurements as those that were solved, with gradients."""
-        visible = solved.by_frame(solved.visible)
+    def measurements(self, seen: Measurements, solved: Measurements) -> Measurements:
+        """Measurements as those that were solved, which are those seen or were moved and weighted since, with gradients."""
+        visible = seen.by_frame(seen.visible)
         keypoints = torch.where(visible[..., None], self.keypoints.double(), 0.0)
         confidence = visible.double() if self.confidence is None else self.confidence.double().where(visible, 0.0)
+        weight = (solved.confidence / seen.confidence).where(seen.visible, 0.0)
         return replace(
             solved,
-            pixels=keypoints.movedim(-1, 2).flatten(3),
-            confidence=confidence.flatten(2),
+            pixels=keypoints.movedim(-1, 2).flatten(3) + (solved.pixels - seen.pixels),
+            confidence=confidence.flatten(2) * weight,
             cameras=self.cameras,
             lengths_m=self.lengths_m,
+            unknowns=self.unknowns,
         )
 
 
@@ -391,11 +473,11 @@ def _each(result: LayerResult, function: Callable[[Tensor], Tensor]) -> LayerRes
     return replace(result, **{name: tensor if tensor is None else function(tensor) for name, tensor in tensors.items()})
 
 
-def _lenses(config: Config) -> tuple[str, ...]:
+def _refined(config: Config) -> tuple[str, ...]:
     """What a configuration refines.
 
     Raises:
-        ConfigError: if that is not of the lenses, or up to the data.
+        ConfigError: if that is up to the data.
     """
     if config.refine == "auto":
         raise ConfigError(
@@ -404,14 +486,5 @@ def _lenses(config: Config) -> tuple[str, ...]:
             got="'auto'",
             expected="a list of what to refine",
             remedy="Calibrate once with refine='auto', and give the layer what was refined.",
-        )
-    clocks = [name for name in config.refine if name in CLOCKS]
-    if clocks:
-        raise ConfigError(
-            "the layer takes clocks as given",
-            where="config.refine",
-            got=clocks,
-            expected="lenses only",
-            remedy="Calibrate once, and give the layer keypoints on one clock.",
         )
     return tuple(config.refine)
