@@ -16,7 +16,7 @@ CLOCK_STAGE = "clocks"
 """What the stage is called that is run again."""
 
 _MAX_ROUNDS = 10
-_MOVED_SHARE, _MOVED_SIGMAS = 0.9, 0.01
+_MOVED_SHARE, _MOVED_SIGMAS = 0.9, 0.001
 """The clocks have converged when this share of the keypoints has moved by less than so many standard deviations."""
 
 
