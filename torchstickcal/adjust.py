@@ -19,7 +19,7 @@ from torchstickcal.observations import Observations
 from torchstickcal.problem import Measurements, State
 from torchstickcal.solvers import Listener
 from torchstickcal.stages import StageRecord, StageResult, rulers, run_stage
-from torchstickcal.synchronise import ClockEstimate, CommonFrames, Exposures, on_common_frames, search_offsets
+from torchstickcal.synchronise import ClockEstimate, CommonFrames, Exposures, on_common_frames, out_of_step, search_offsets
 from torchstickcal.uncertainty import camera_covariance, point_variances
 
 _CLOCK_STAGE = "clocks"
@@ -154,9 +154,18 @@ class Adjuster:
 
     def search(self) -> ClockEstimate:
         """The clocks' offsets by the motion in the images."""
+        return search_offsets(*self._as_told())
+
+    @property
+    def out_of_step(self) -> bool:
+        """Whether the cameras' frames clearly do not belong together as told, by the motion in the images."""
+        return out_of_step(*self._as_told())
+
+    def _as_told(self) -> tuple[Measurements, float]:
+        """The keypoints on the clocks as told, and the largest offset that is looked for, frames."""
         frames = on_common_frames(self._observations)
         assert frames.rate_hz is not None
-        return search_offsets(self._seen(frames), self._settings.max_offset_s * frames.rate_hz)
+        return self._seen(frames), self._settings.max_offset_s * frames.rate_hz
 
     def _seen(self, frames: CommonFrames) -> Measurements:
         """The keypoints that may take part."""
@@ -173,12 +182,7 @@ class Adjuster:
         Raises:
             RigError: if the cameras cannot be placed in one rig.
         """
-        adjustment = self._begin(refined, offsets_frames)
-        for _ in range(_MAX_STARTS - 1):
-            if not bool((adjustment.late_frames.abs() > _FAR_FRAMES).any()):
-                break
-            adjustment = self._begin(refined, adjustment.frames.offsets_frames + adjustment.late_frames)
-        return adjustment
+        return self._nearer(self._begin(refined, offsets_frames))
 
     def _begin(self, refined: Sequence[str], offsets_frames: Tensor | None) -> Adjustment:
         """Initialised with the cameras' frames side by side at some offsets, and adjusted."""
@@ -209,7 +213,15 @@ class Adjuster:
             records = []
             result = self._through(self._adjusting, measurements, state, records)
         started = replace(adjustment, seen=seen, measurements=measurements, refined=tuple(refined))
-        return self._on_one_clock(replace(started, result=result, records=tuple(records)))
+        return self._nearer(self._on_one_clock(replace(started, result=result, records=tuple(records))))
+
+    def _nearer(self, adjustment: Adjustment) -> Adjustment:
+        """Begun again with the cameras' frames at the common frames nearest to them, if these are others than was thought."""
+        for _ in range(_MAX_STARTS - 1):
+            if not bool((adjustment.late_frames.abs() > _FAR_FRAMES).any()):
+                break
+            adjustment = self._begin(adjustment.refined, adjustment.frames.offsets_frames + adjustment.late_frames)
+        return adjustment
 
     def held(self, adjustment: Adjustment) -> Adjustment:
         """The stages that follow once the cameras are found."""
