@@ -134,6 +134,10 @@ class Adjuster:
         observations: the session.
         settings: the configuration.
         listener: hears every iteration.
+
+    Raises:
+        ConfigError: if nothing sets the scale.
+        ObservationError: if clocks are to be found without what they are counted in.
     """
 
     def __init__(self, observations: Observations, settings: Config, listener: Listener) -> None:
@@ -142,6 +146,14 @@ class Adjuster:
         self._adjusting, self._holding = _split(settings.stages)
         self.seconds: dict[str, float] = {}
         """time by step"""
+        impossible = set() if settings.refine == "auto" else set(settings.refine) - self.refinable
+        if impossible:
+            raise ObservationError(
+                "clocks without what they are counted in",
+                where="refine",
+                got=", ".join(sorted(impossible)),
+                expected="fps or timestamps, and for readout the image size",
+            )
 
     @property
     def refinable(self) -> set[str]:
@@ -278,16 +290,7 @@ class Adjuster:
 
         Raises:
             ConfigError: if there are camera groups, but not a label for each camera.
-            ObservationError: if clocks are asked for without what they are counted in.
         """
-        impossible = set(names) - self.refinable
-        if impossible:
-            raise ObservationError(
-                "clocks without what they are counted in",
-                where="refine",
-                got=", ".join(sorted(impossible)),
-                expected="fps or timestamps, and for readout the image size",
-            )
         return replace(seen, unknowns=CameraUnknowns.of(names, seen.cameras, self._settings.camera_groups) if names else None)
 
 
@@ -329,4 +332,6 @@ def _movement(placed: Measurements, before: Measurements, result: StageResult) -
     """Distance that most keypoints moved since they were placed before, in standard deviations of their noise."""
     moved = (placed.pixels_at(result.state) - before.pixels_at(result.state)).square().sum(-2).sqrt()
     sigmas = (before.by_frame(moved) / result.sigma_px[:, None, None])[before.by_frame(result.inliers)]
+    if not len(sigmas):
+        return 0.0
     return float(sigmas.kthvalue(max(1, int(_MOVED_SHARE * len(sigmas)))).values)
