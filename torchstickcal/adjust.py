@@ -323,9 +323,9 @@ def _starting(seen: Measurements, state: State, before: CameraUnknowns | None = 
 
 def _placed(adjustment: Adjustment, seen: Measurements, state: State) -> Measurements:
     """Keypoints as seen, brought to the common clock at a state by the motion that an adjustment has found."""
-    result = adjustment.result
-    variance = point_variances(adjustment.kept, result.state, result.sigma_px)
-    return adjustment.exposures.placed(seen, state, variance, result.sigma_px)
+    result, kept = adjustment.result, adjustment.kept
+    variance = point_variances(kept, result.state, result.sigma_px)
+    return adjustment.exposures.placed(seen, state, variance, kept.visible.sum(1), result.sigma_px)
 
 
 def _movement(placed: Measurements, before: Measurements, result: StageResult) -> float:

@@ -24,8 +24,9 @@ _LEAST_PIVOT = 0.05
 _SMOOTH_DEGREES, _ROUGH_DEGREES = 2, 3
 """The lowest degrees count as motion whatever their size, the highest as a sign of more between the frames."""
 _NEIGHBOURS = (-3, -2, -1, 1, 2, 3)
-_UNSTEADY = 5.0
-"""Distance from where the neighbours in time have a point, over what is usual about it, from which on it is not believed."""
+_UNSTEADY, _UNSTEADY_CONFIRMED = 4.0, 12.0
+"""Distance from where the neighbours in time have a point, over what is usual about it, from which on it is not believed: one
+that two cameras hold, and one that a third confirms."""
 _CHANCE = 2.0
 """Standard deviations of the residual beyond its mean up to which a polynomial follows the motion."""
 _INTERPOLATION_SHARE = 0.15
@@ -64,10 +65,11 @@ class Trajectories:
     Args:
         points: (3, F, P), metres.
         variance: (F, P), of a point along an axis, square metres; infinite where it is not known.
+        views: (F, P), how many cameras hold a point.
     """
 
-    def __init__(self, points: Tensor, variance: Tensor) -> None:
-        known = variance.isfinite() & _steady(points, variance)
+    def __init__(self, points: Tensor, variance: Tensor, views: Tensor) -> None:
+        known = variance.isfinite() & _steady(points, variance, views)
         around = (0, 0, _REACHES[-1], _REACHES[-1])
         information = torch.where(known, variance.clamp_min(1e-300).reciprocal(), 0.0)
         self._information = torch.nn.functional.pad(information, around)
@@ -112,7 +114,7 @@ class Trajectories:
         return Pieces((powers @ smooth).permute(1, 2, 0).contiguous(), roughness), follows
 
 
-def _steady(points: Tensor, variance: Tensor) -> Tensor:
+def _steady(points: Tensor, variance: Tensor, views: Tensor) -> Tensor:
     """Whether points are near where their neighbours in time have them (F, P), for their pace.
 
     A point that two cameras see has no third to contradict a wrong keypoint; its neighbours do.
@@ -123,7 +125,8 @@ def _steady(points: Tensor, variance: Tensor) -> Tensor:
     onward = [2 * near[k] - near[2 * k] for k in (-1, 1)]
     away = (seen - torch.stack([*middles, *onward]).nanmedian(0).values).square().sum(0).sqrt()
     usual = _around(away, range(-_REACHES[1], _REACHES[1] + 1)).nanmedian(0).values
-    return ~(away > _UNSTEADY * (usual + (3 * variance).sqrt()))
+    limit = torch.where(views > 2, _UNSTEADY_CONFIRMED, _UNSTEADY)
+    return ~(away > limit * (usual + (3 * variance).sqrt()))
 
 
 def _around(values: Tensor, steps: Sequence[int]) -> Tensor:

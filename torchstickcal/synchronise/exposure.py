@@ -52,20 +52,23 @@ class Exposures:
         reckoned = torch.zeros_like(measurements.unknowns.prior_sigma)
         return replace(measurements, motion=self._motion(torch.zeros_like(measurements.pixels), reckoned))
 
-    def placed(self, measurements: Measurements, state: State, variance: Tensor, sigma_px: Tensor) -> Measurements:
+    def placed(
+        self, measurements: Measurements, state: State, variance: Tensor, views: Tensor, sigma_px: Tensor
+    ) -> Measurements:
         """Measurements with their keypoints moved to the common frames, and less weight where the motion between is not known.
 
         Args:
             measurements: one session as seen.
             state: the cameras, points and unknowns at which to place them.
             variance: of the points along an axis, (1, N), square metres; infinite where a point is not known.
+            views: how many cameras hold a point, (1, N).
             sigma_px: noise of each point's keypoints, (1, P).
         """
         m, unknowns = measurements, measurements.unknowns
         delays = self.delays
         if unknowns is not None and state.unknowns is not None:
             delays = delays + unknowns.delays(self.rows[None], state.unknowns)[0]
-        trajectories = Trajectories(m.by_frame(state.points)[0], m.by_frame(variance)[0])
+        trajectories = Trajectories(*(m.by_frame(of_points)[0] for of_points in (state.points, variance, views)))
         cameras = m.cameras_at(state).to(torch.float64)[0]
         pose = state.rotations[0], state.translations[0]
         pixels, velocity, confidence = m.pixels.clone(), torch.empty_like(m.pixels), m.confidence.clone()
