@@ -24,11 +24,13 @@ from torchstickcal.synchronise import (
     ClockEstimate,
     CommonFrames,
     Exposures,
+    Support,
     on_common_frames,
     on_one_clock,
+    out_of_step,
     search_offsets,
 )
-from torchstickcal.uncertainty import camera_covariance, point_variances
+from torchstickcal.uncertainty import camera_covariance
 
 _MAX_STARTS = 3
 _CHECKED_FRAMES = 5000
@@ -137,6 +139,10 @@ class Adjuster:
         observations: the session.
         settings: the configuration.
         listener: hears every iteration.
+
+    Raises:
+        ConfigError: if nothing sets the scale.
+        ObservationError: if clocks are to be found without what they are counted in.
     """
 
     def __init__(self, observations: Observations, settings: Config, listener: Listener) -> None:
@@ -145,6 +151,14 @@ class Adjuster:
         self._adjusting, self._holding = _split(settings.stages)
         self.seconds: dict[str, float] = {}
         """time by step"""
+        impossible = set() if settings.refine == "auto" else set(settings.refine) - self.refinable
+        if impossible:
+            raise ObservationError(
+                "clocks without what they are counted in",
+                where="refine",
+                got=", ".join(sorted(impossible)),
+                expected="fps or timestamps, and for readout the image size",
+            )
 
     @property
     def refinable(self) -> set[str]:
@@ -157,9 +171,18 @@ class Adjuster:
 
     def search(self) -> ClockEstimate:
         """The clocks' offsets by the motion in the images."""
+        return search_offsets(*self._as_told())
+
+    @property
+    def out_of_step(self) -> bool:
+        """Whether the cameras' frames clearly do not belong together as told, by the motion in the images."""
+        return out_of_step(*self._as_told())
+
+    def _as_told(self) -> tuple[Measurements, float]:
+        """The keypoints on the clocks as told, and the largest offset that is looked for, frames."""
         frames = on_common_frames(self._observations)
         assert frames.rate_hz is not None
-        return search_offsets(self._seen(frames), self._settings.max_offset_s * frames.rate_hz)
+        return self._seen(frames), self._settings.max_offset_s * frames.rate_hz
 
     def _seen(self, frames: CommonFrames) -> Measurements:
         """The keypoints that may take part."""
@@ -176,12 +199,7 @@ class Adjuster:
         Raises:
             RigError: if the cameras cannot be placed in one rig.
         """
-        adjustment = self._begin(refined, offsets_frames)
-        for _ in range(_MAX_STARTS - 1):
-            if not bool((adjustment.late_frames.abs() > _FAR_FRAMES).any()):
-                break
-            adjustment = self._begin(refined, adjustment.frames.offsets_frames + adjustment.late_frames)
-        return adjustment
+        return self._nearer(self._begin(refined, offsets_frames))
 
     def _begin(self, refined: Sequence[str], offsets_frames: Tensor | None) -> Adjustment:
         """Initialised with the cameras' frames side by side at some offsets, and adjusted."""
@@ -212,7 +230,15 @@ class Adjuster:
             records = []
             result = self._through(self._adjusting, measurements, state, records)
         started = replace(adjustment, seen=seen, measurements=measurements, refined=tuple(refined))
-        return self._on_one_clock(replace(started, result=result, records=tuple(records)))
+        return self._nearer(self._on_one_clock(replace(started, result=result, records=tuple(records))))
+
+    def _nearer(self, adjustment: Adjustment) -> Adjustment:
+        """Begun again with the cameras' frames at the common frames nearest to them, if these are others than was thought."""
+        for _ in range(_MAX_STARTS - 1):
+            if not bool((adjustment.late_frames.abs() > _FAR_FRAMES).any()):
+                break
+            adjustment = self._begin(adjustment.refined, adjustment.frames.offsets_frames + adjustment.late_frames)
+        return adjustment
 
     def held(self, adjustment: Adjustment) -> Adjustment:
         """The stages that follow once the cameras are found."""
@@ -268,16 +294,7 @@ class Adjuster:
 
         Raises:
             ConfigError: if there are camera groups, but not a label for each camera.
-            ObservationError: if clocks are asked for without what they are counted in.
         """
-        impossible = set(names) - self.refinable
-        if impossible:
-            raise ObservationError(
-                "clocks without what they are counted in",
-                where="refine",
-                got=", ".join(sorted(impossible)),
-                expected="fps or timestamps, and for readout the image size",
-            )
         return replace(seen, unknowns=CameraUnknowns.of(names, seen.cameras, self._settings.camera_groups) if names else None)
 
 
@@ -311,5 +328,4 @@ def _starting(seen: Measurements, state: State, before: CameraUnknowns | None = 
 def _placed(adjustment: Adjustment, seen: Measurements, state: State) -> Measurements:
     """Keypoints as seen, brought to the common clock at a state by the motion that an adjustment has found."""
     result = adjustment.result
-    variance = point_variances(adjustment.kept, result.state, result.sigma_px)
-    return adjustment.exposures.placed(seen, state, variance, result.sigma_px)
+    return adjustment.exposures.placed(seen, state, Support.of(adjustment.kept, result.state, result.sigma_px))

@@ -24,8 +24,7 @@ from torchstickcal.problem import Measurements, State
 from torchstickcal.solvers import unheard
 from torchstickcal.solvers.newton import polish
 from torchstickcal.stages import Ruler, StageResult, rulers, run_stage, scale_factors
-from torchstickcal.synchronise import CLOCK_STAGE, Exposures, on_one_clock
-from torchstickcal.uncertainty import point_variances
+from torchstickcal.synchronise import CLOCK_STAGE, Exposures, Support, on_one_clock
 from torchstickcal.workers import map_on_workers
 
 _KEYPOINTS_AT_ONCE = 32_000
@@ -205,8 +204,8 @@ class CalibrationLayer(nn.Module):
         if not given.clocked:
             return _Begun(observations, refined, resting, state)
         sigma_px = initial.sigma_px[index][None].detach().double()
-        variance = point_variances(resting.keeping(initial.inliers[index].flatten(1)[None]), state, sigma_px)
-        return _Begun(observations, refined, given.exposures.placed(refined, state, variance, sigma_px), state)
+        support = Support.of(resting.keeping(initial.inliers[index].flatten(1)[None]), state, sigma_px)
+        return _Begun(observations, refined, given.exposures.placed(refined, state, support), state)
 
     def _solve(self, given: _Given, begun: list[_Begun], warm: bool) -> list[_Solved]:
         """Run the stages on sessions side by side, then tie the last ones to what was given."""

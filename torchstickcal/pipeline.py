@@ -19,9 +19,6 @@ from torchstickcal.solvers import IterationRecord, unheard
 from torchstickcal.synchronise import ClockEstimate
 from torchstickcal.workers import on_worker
 
-_SEARCHED_FRAMES = 0.5
-"""Offset found by the search from which on it is another start than the one told."""
-
 
 class Callback(Protocol):
     """What may listen to a calibration: a progress bar, TensorBoard, a test."""
@@ -83,8 +80,8 @@ def _calibrated(observations: Observations, settings: Config, callback: Callback
 def _synchronised(adjuster: Adjuster, settings: Config) -> tuple[Adjustment, ClockEstimate | None]:
     """The session adjusted with the unknowns that the configuration names, and what a search for the clocks has found.
 
-    The clocks are searched for where they may differ and the cameras do not fit together as told, or the data say so; what the
-    search finds is taken if the views then agree better.
+    The clocks are searched for where they may differ, and the cameras are clearly out of step or do not fit together. Of the
+    offsets told and those found, the ones at which the views agree best are taken.
 
     Raises:
         RigError: if the cameras cannot be placed in one rig.
@@ -93,37 +90,34 @@ def _synchronised(adjuster: Adjuster, settings: Config) -> tuple[Adjustment, Clo
     lenses = tuple(name for name in refined if name not in CLOCKS)
     searchable = "time_offset" in (_free(adjuster, settings) if settings.refine == "auto" else refined)
     clocks: ClockEstimate | None = None
-    try:
-        adjusted = adjuster.begin(lenses)
-        doubted = searchable and not (adjusted.fits and adjuster.check(adjusted).gain(("time_offset",)) <= 0)
-    except RigError:
-        if not searchable:
-            raise
-        adjusted, doubted = None, True
-    if doubted:
-        clocks = adjuster.search()
-        moved = _moved(adjuster, with_refinements(refined, ("time_offset",)), clocks, needed=adjusted is None)
-        if moved is not None and (adjusted is None or moved.median_residual < adjusted.median_residual):
-            return moved, clocks
-    assert adjusted is not None
-    return adjuster.again(adjusted, refined) if refined != lenses else adjusted, clocks
-
-
-def _moved(adjuster: Adjuster, refined: Sequence[str], clocks: ClockEstimate, needed: bool) -> Adjustment | None:
-    """The session adjusted at the offsets that a search has found, where these are others than those told, or it is needed.
-
-    Where some are not sure, the likeliest and those told are tried; the views decide.
-    """
-    tried = [clocks.likeliest_frames, *([] if all(clocks.determined) else [clocks.offsets_frames])]
     found: list[Adjustment] = []
-    for offsets in tried:
-        if needed or bool((offsets.abs() >= _SEARCHED_FRAMES).any()):
-            try:
-                found.append(adjuster.begin(refined, offsets))
-            except (RigError, ObservationError):
-                if needed and offsets is tried[-1] and not found:
-                    raise
-    return min(found, key=lambda adjustment: adjustment.median_residual, default=None)
+    if searchable and adjuster.out_of_step:
+        clocks = adjuster.search()
+        found += _at_offsets(adjuster, refined, clocks)
+    if not any(adjustment.fits for adjustment in found):
+        try:
+            found.append(adjuster.begin(lenses))
+        except RigError:
+            if not (searchable or found):
+                raise
+    if searchable and clocks is None and not any(adjustment.fits for adjustment in found):
+        clocks = adjuster.search()
+        found += _at_offsets(adjuster, refined, clocks)
+    if not found:
+        found.append(adjuster.begin(lenses))
+    best = min(found, key=lambda adjustment: adjustment.median_residual)
+    return best if set(refined) <= set(best.refined) else adjuster.again(best, refined), clocks
+
+
+def _at_offsets(adjuster: Adjuster, refined: Sequence[str], clocks: ClockEstimate) -> list[Adjustment]:
+    """The session adjusted at the offsets that a search has found; where some are not sure, at the likeliest and as told."""
+    found: list[Adjustment] = []
+    for offsets in (clocks.likeliest_frames, *(() if all(clocks.determined) else (clocks.offsets_frames,))):
+        try:
+            found.append(adjuster.begin(with_refinements(refined, ("time_offset",)), offsets))
+        except (RigError, ObservationError):
+            continue
+    return found
 
 
 def _chosen(adjuster: Adjuster, settings: Config, adjusted: Adjustment) -> Adjustment:

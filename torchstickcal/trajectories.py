@@ -8,6 +8,7 @@ degree down). Little noise matters more than it seems: noise in the velocity mak
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from functools import lru_cache
 from typing import NamedTuple
 
@@ -22,6 +23,10 @@ _LEAST_PIVOT = 0.05
 """Share of a basis polynomial that lower degrees leave at the known frames, below which the frames do not determine it."""
 _SMOOTH_DEGREES, _ROUGH_DEGREES = 2, 3
 """The lowest degrees count as motion whatever their size, the highest as a sign of more between the frames."""
+_NEIGHBOURS = (-3, -2, -1, 1, 2, 3)
+_UNSTEADY, _UNSTEADY_CONFIRMED = 4.0, 12.0
+"""Distance from where the neighbours in time have a point, over what is usual about it, from which on it is not believed: one
+that two cameras hold, and one that a third confirms."""
 _CHANCE = 2.0
 """Standard deviations of the residual beyond its mean up to which a polynomial follows the motion."""
 _INTERPOLATION_SHARE = 0.15
@@ -60,10 +65,11 @@ class Trajectories:
     Args:
         points: (3, F, P), metres.
         variance: (F, P), of a point along an axis, square metres; infinite where it is not known.
+        views: (F, P), how many cameras hold a point.
     """
 
-    def __init__(self, points: Tensor, variance: Tensor) -> None:
-        known = variance.isfinite()
+    def __init__(self, points: Tensor, variance: Tensor, views: Tensor) -> None:
+        known = variance.isfinite() & _steady(points, variance, views)
         around = (0, 0, _REACHES[-1], _REACHES[-1])
         information = torch.where(known, variance.clamp_min(1e-300).reciprocal(), 0.0)
         self._information = torch.nn.functional.pad(information, around)
@@ -106,6 +112,28 @@ class Trajectories:
         unexplained = ((points.square().sum(1) * weights).sum(1) - energies[:, 0]) * most[:, 0]
         follows = (unexplained <= freedom + _CHANCE * (2 * freedom).sqrt()) & (freedom > 0)
         return Pieces((powers @ smooth).permute(1, 2, 0).contiguous(), roughness), follows
+
+
+def _steady(points: Tensor, variance: Tensor, views: Tensor) -> Tensor:
+    """Whether points are near where their neighbours in time have them (F, P), for their pace.
+
+    A point that two cameras see has no third to contradict a wrong keypoint; its neighbours do.
+    """
+    seen = points.where(variance.isfinite(), torch.nan)
+    near = dict(zip(_NEIGHBOURS, _around(seen, _NEIGHBOURS), strict=True))
+    middles = [(near[-k] + near[k]) / 2 for k in (1, 2, 3)]
+    onward = [2 * near[k] - near[2 * k] for k in (-1, 1)]
+    away = (seen - torch.stack([*middles, *onward]).nanmedian(0).values).square().sum(0).sqrt()
+    usual = _around(away, range(-_REACHES[1], _REACHES[1] + 1)).nanmedian(0).values
+    limit = torch.where(views > 2, _UNSTEADY_CONFIRMED, _UNSTEADY)
+    return ~(away > limit * (usual + (3 * variance).sqrt()))
+
+
+def _around(values: Tensor, steps: Sequence[int]) -> Tensor:
+    """Values (..., F, P) some frames away from each, one after another, NaN beyond the ends."""
+    widest, frames = max(map(abs, steps)), values.shape[-2]
+    padded = torch.nn.functional.pad(values, (0, 0, widest, widest), value=torch.nan)
+    return torch.stack([padded[..., widest + k : widest + k + frames, :] for k in steps])
 
 
 @lru_cache

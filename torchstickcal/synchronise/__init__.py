@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 from torchstickcal.synchronise.common_clock import CLOCK_STAGE, on_one_clock
-from torchstickcal.synchronise.exposure import Exposures
+from torchstickcal.synchronise.exposure import Exposures, Support
 from torchstickcal.synchronise.frames import CommonFrames, on_common_frames
-from torchstickcal.synchronise.search import ClockEstimate, search_offsets
+from torchstickcal.synchronise.search import ClockEstimate, out_of_step, search_offsets
 
 __all__ = [
     "CLOCK_STAGE",
     "ClockEstimate",
     "CommonFrames",
     "Exposures",
+    "Support",
     "on_common_frames",
     "on_one_clock",
+    "out_of_step",
     "search_offsets",
 ]

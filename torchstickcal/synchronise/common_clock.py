@@ -9,8 +9,7 @@ from torch import Tensor
 
 from torchstickcal.problem import Measurements, State
 from torchstickcal.stages import StageResult
-from torchstickcal.synchronise.exposure import Exposures
-from torchstickcal.uncertainty import point_variances
+from torchstickcal.synchronise.exposure import Exposures, Support
 
 CLOCK_STAGE = "clocks"
 """What the stage is called that is run again."""
@@ -36,22 +35,22 @@ def on_one_clock(
         result: where it has ended there.
         run: the stage, on other measurements from a state.
     """
-    variance = _variances(measurements, result)
-    going = torch.ones(seen.sessions, dtype=torch.bool, device=variance.device)
+    support = _support(measurements, result)
+    going = torch.ones(seen.sessions, dtype=torch.bool, device=seen.pixels.device)
     for number in range(_MAX_ROUNDS):
-        placed = exposures.placed(seen, result.state, variance, result.sigma_px)
+        placed = exposures.placed(seen, result.state, support)
         if number > 0:
             going = _moved(placed, measurements, result)
         measurements = placed
         if not bool(going.any()):
             break
         result = result.replaced(going, run(placed, result.state))
-        variance = torch.where(going[:, None], _variances(placed, result), variance)
+        support = support.replaced(going, _support(placed, result))
     return measurements, result
 
 
-def _variances(measurements: Measurements, result: StageResult) -> Tensor:
-    return point_variances(measurements.keeping(result.inliers), result.state, result.sigma_px)
+def _support(measurements: Measurements, result: StageResult) -> Support:
+    return Support.of(measurements.keeping(result.inliers), result.state, result.sigma_px)
 
 
 def _moved(placed: Measurements, before: Measurements, result: StageResult) -> Tensor:

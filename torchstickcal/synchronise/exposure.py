@@ -8,6 +8,7 @@ taken anew from each adjustment.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -17,6 +18,27 @@ from torchstickcal.cameras import Intrinsics, inverse_depths
 from torchstickcal.problem import Measurements, State
 from torchstickcal.synchronise.frames import CommonFrames
 from torchstickcal.trajectories import Trajectories
+from torchstickcal.uncertainty import point_variances
+
+
+class Support(NamedTuple):
+    """What holds the points of B sessions where they are."""
+
+    variance: Tensor
+    """of a point along an axis, (B, N), square metres; infinite where it is not known"""
+    views: Tensor
+    """how many cameras hold a point, (B, N)"""
+    sigma_px: Tensor
+    """noise of each point's keypoints, (B, P)"""
+
+    @staticmethod
+    def of(measurements: Measurements, state: State, sigma_px: Tensor) -> Support:
+        """That of the measurements that took part, at a state; the noise is that of each point's keypoints, (B, P)."""
+        return Support(point_variances(measurements, state, sigma_px), measurements.visible.sum(1), sigma_px)
+
+    def replaced(self, where: Tensor, other: Support) -> Support:
+        """The same with some sessions (B,), True where, taken from another."""
+        return Support(*(torch.where(where[:, None], new, old) for old, new in zip(self, other, strict=True)))
 
 
 @dataclass(frozen=True)
@@ -67,14 +89,13 @@ class Exposures:
         reckoned = torch.zeros_like(measurements.unknowns.prior_sigma)
         return replace(measurements, motion=self._motion(torch.zeros_like(measurements.pixels), reckoned))
 
-    def placed(self, measurements: Measurements, state: State, variance: Tensor, sigma_px: Tensor) -> Measurements:
+    def placed(self, measurements: Measurements, state: State, support: Support) -> Measurements:
         """Measurements with their keypoints moved to the common frames, and less weight where the motion between is not known.
 
         Args:
             measurements: the sessions as seen.
             state: the cameras, points and unknowns at which to place them.
-            variance: of the points along an axis, (B, N), square metres; infinite where a point is not known.
-            sigma_px: noise of each point's keypoints, (B, P).
+            support: what holds the points.
         """
         m, unknowns = measurements, measurements.unknowns
         delays = self.delays
@@ -83,7 +104,8 @@ class Exposures:
         every_camera = m.cameras_at(state).to(torch.float64)
         pixels, velocity, confidence = m.pixels.clone(), torch.empty_like(m.pixels), m.confidence.clone()
         for session in range(m.sessions):
-            trajectories = Trajectories(m.by_frame(state.points[session]), m.by_frame(variance[session]))
+            tracks = (m.by_frame(of_points[session]) for of_points in (state.points, support.variance, support.views))
+            trajectories = Trajectories(*tracks)
             cameras, pose = every_camera[session], (state.rotations[session], state.translations[session])
             for columns, frames in zip(m.chunks(), m.frame_slices(), strict=True):
                 pieces, delay = trajectories.pieces(frames), delays[session, :, columns]
@@ -93,7 +115,7 @@ class Exposures:
                 pixels[session, ..., columns] -= moved.where(((depth > 0) & (z > 0))[:, None], 0.0).to(pixels.dtype)
                 velocity[session, ..., columns] = moving.where((depth > 0)[:, None], 0.0).to(pixels.dtype)
                 deviation = pieces.deviations_m(delay) * cameras.focal_px[:, None] * depth
-                variance_ratio = (deviation / sigma_px[session].repeat(frames.stop - frames.start)).square()
+                variance_ratio = (deviation / support.sigma_px[session].repeat(frames.stop - frames.start)).square()
                 weights = confidence[session, :, columns]
                 weights /= 1 + weights * variance_ratio.to(pixels.dtype)
         reckoned = torch.zeros(m.sessions, 0).to(state.points) if state.unknowns is None else state.unknowns
