@@ -138,7 +138,7 @@ def test_gradients_are_those_of_the_solve_with_the_motion_as_it_is(monkeypatch: 
 
 
 def test_gradients_are_near_those_of_the_whole_layer(monkeypatch: pytest.MonkeyPatch):
-    """The motion depends on the keypoints too, most on errors that differ from frame to frame: those of a drift are few."""
+    """That the motion depends on the keypoints too is left out: here 3 and 6 % for the offsets, 0.2 % for the cameras."""
     monkeypatch.setattr(common_clock, "_MOVED_SIGMAS", 0.0)
     session = SPEC.generate()
     layer = layer_of(session, "time_offset")
