@@ -34,7 +34,7 @@ from torchstickcal.uncertainty import camera_covariance
 
 _MAX_STARTS = 3
 _CHECKED_FRAMES = 5000
-_FITTING_SHARE, _FITTING_FOCAL_SHARE = 0.9, 0.01
+_FITTING_SHARE, _FITTING_FOCAL_SHARE = 0.6, 0.01
 """Least share of the keypoints that agree, and largest noise over the focal length, where the cameras fit together."""
 _FAR_FRAMES = 0.75
 """Offset from where a camera's frames were placed from which on others are nearer."""
@@ -214,7 +214,7 @@ class Adjuster:
             refined = refined if "focal" in refined else with_refinements(refined, ("focal_shared",))
         self._took("initialise", time.perf_counter() - began)
         seen = self._refining(seen, refined)
-        measurements, records = Exposures.of(frames).resting(seen), []
+        measurements, records = _resting(frames, seen), []
         result = self._through(self._adjusting, measurements, _starting(seen, state), records)
         return self._on_one_clock(Adjustment(frames, seen, measurements, tuple(refined), result, tuple(records)))
 
@@ -223,7 +223,7 @@ class Adjuster:
         seen, old = self._refining(adjustment.seen, refined), adjustment.result.state
         state = _starting(seen, old, adjustment.seen.unknowns)
         result = adjustment.result._replace(state=state)
-        measurements, records = adjustment.exposures.resting(seen), list(adjustment.records)
+        measurements, records = _resting(adjustment.frames, seen), list(adjustment.records)
         if adjustment.apart:
             measurements = _placed(adjustment, seen, state)
         if set(refined) - set(adjustment.refined) - CLOCKS:
@@ -323,6 +323,11 @@ def _starting(seen: Measurements, state: State, before: CameraUnknowns | None = 
     if before is None or state.unknowns is None:
         return replace(state, unknowns=nothing)
     return replace(state, unknowns=seen.unknowns.taken_over(before, state.unknowns))
+
+
+def _resting(frames: CommonFrames, seen: Measurements) -> Measurements:
+    """Keypoints as seen, as if nothing moved, where clocks are among the unknowns."""
+    return Exposures.of(frames).resting(seen) if seen.unknowns is not None and seen.unknowns.clocked else seen
 
 
 def _placed(adjustment: Adjustment, seen: Measurements, state: State) -> Measurements:

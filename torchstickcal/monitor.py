@@ -15,8 +15,8 @@ from torchstickcal.solvers import IterationRecord
 class TensorBoardMonitor:
     """A callback of :func:`torchstickcal.calibrate` that writes what happens to a TensorBoard log.
 
-    Per stage and iteration: the value of each loss, damping, step, reprojection of each camera and the sticks' mean length;
-    at the end a figure of the rig and the summary table.
+    Per stage and iteration: the value of each loss, damping, step, reprojection of each camera and the sticks' mean length, on
+    from where the stage ended if it runs again; at the end a figure of the rig and the summary table.
 
     Args:
         log_dir: folder of the log, made if need be.
@@ -24,19 +24,19 @@ class TensorBoardMonitor:
 
     def __init__(self, log_dir: str | Path) -> None:
         self._writer = SummaryWriter(str(log_dir))
-        self._stages: list[str] = []
+        self._steps: dict[str, int] = {}
 
     def on_iteration(self, record: IterationRecord) -> None:
         """Write one iteration."""
-        if record.stage not in self._stages:
-            self._stages.append(record.stage)
-        stage = f"{len(self._stages)} {record.stage}"
+        step = self._steps.setdefault(record.stage, 0)
+        self._steps[record.stage] += 1
+        stage = f"{list(self._steps).index(record.stage) + 1} {record.stage}"
         scalars = {"cost": record.cost, "damping": record.damping, "step_m": record.step_m}
         scalars |= {f"loss/{name}": value for name, value in record.terms.items()}
         scalars |= {f"reprojection_px/camera_{index}": value for index, value in enumerate(record.reprojection_px)}
         scalars |= {"stick_length_m": record.stick_length_m}
         for name, value in scalars.items():
-            self._writer.add_scalar(f"{stage}/{name}", value, record.iteration)
+            self._writer.add_scalar(f"{stage}/{name}", value, step)
 
     def on_end(self, calibration: Calibration) -> None:
         """Write the result and close the log."""

@@ -24,7 +24,7 @@ _LEAST_PIVOT = 0.05
 _SMOOTH_DEGREES, _ROUGH_DEGREES = 2, 3
 """The lowest degrees count as motion whatever their size, the highest as a sign of more between the frames."""
 _NEIGHBOURS = (-3, -2, -1, 1, 2, 3)
-_UNSTEADY, _UNSTEADY_CONFIRMED = 4.0, 12.0
+_UNSTEADY, _UNSTEADY_CONFIRMED = 4.0, 8.0
 """Distance from where the neighbours in time have a point, over what is usual about it, from which on it is not believed: one
 that two cameras hold, and one that a third confirms."""
 _CHANCE = 2.0

@@ -83,9 +83,8 @@ class Exposures:
         return Exposures(self.delays[sessions], self.rows[sessions])
 
     def resting(self, measurements: Measurements) -> Measurements:
-        """Measurements as if nothing moved: where trajectories are not known yet."""
-        if measurements.unknowns is None or not measurements.unknowns.clocked:
-            return measurements
+        """Measurements with clocks among their unknowns as if nothing moved: where trajectories are not known yet."""
+        assert measurements.unknowns is not None
         reckoned = torch.zeros_like(measurements.unknowns.prior_sigma)
         return replace(measurements, motion=self._motion(torch.zeros_like(measurements.pixels), reckoned))
 

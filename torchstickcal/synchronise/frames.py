@@ -39,6 +39,8 @@ class CommonFrames:
 
     def to_own(self, values: Tensor, fill: float) -> Tensor:
         """Values (C, G, ...) of the common frames at the cameras' own frames, (C, F, ...)."""
+        if _in_place(self.index):
+            return values
         cameras = torch.arange(len(self.index), device=self.index.device)[:, None]
         missing = (self.index < 0).view(*self.index.shape, *[1] * (values.ndim - 2))
         return values[cameras, self.index.clamp_min(0)].masked_fill(missing, fill)
@@ -73,7 +75,7 @@ def on_common_frames(observations: Observations, offsets_frames: Tensor | None =
     lags = begins.nan_to_num() - common
     index = torch.where(exists & (common >= first) & (common <= last), common - first, -1)
     index = _nearest(index, lags, last - first + 1)
-    if torch.equal(index, torch.arange(index.shape[1], device=index.device).expand_as(index)):
+    if _in_place(index):
         return CommonFrames(observations, index, lags, offsets, first, rate)
     placed = _Placed(index, last - first + 1)
     confidence = observations.confidence
@@ -95,6 +97,11 @@ def _begins(observations: Observations) -> tuple[float | None, Tensor]:
         return observations.fps, frames.expand(observations.num_cameras, -1)
     rate = observations.fps or float(max(1 / camera[camera.isfinite()].diff().median() for camera in times.double()))
     return rate, times.double() * rate
+
+
+def _in_place(index: Tensor) -> bool:
+    """Whether every camera's own frames are the common ones."""
+    return torch.equal(index, torch.arange(index.shape[1], device=index.device).expand_as(index))
 
 
 def _nearest(index: Tensor, lags: Tensor, frames: int) -> Tensor:
