@@ -187,7 +187,7 @@ class CalibrationLayer(nn.Module):
         given = given.of_sessions([index])
         seen = Measurements.of(observations, points_used(observations, self.config))
         refined = replace(seen, unknowns=given.unknowns)
-        resting = given.exposures.resting(refined)
+        resting = given.exposures.resting(refined) if given.clocked else refined
         settings = self.config.initialise
         if initial is None or not bool(initial.converged[index]):
             labels = [observations.camera_label(camera) for camera in range(observations.num_cameras)]
