@@ -107,6 +107,12 @@ def test_clocks_that_are_apart_are_told_where_they_are_not_found():
     assert not [warning for warning in calibrate(SPEC.generate().observations).warnings if "later than told" in warning]
 
 
+def test_cameras_frames_apart_are_told_where_they_are_not_searched_for():
+    apart = replace(SPEC, clocks=Clocks(1.0)).generate().observations
+    assert any("do not seem to be in step" in warning for warning in calibrate(apart).warnings)
+    assert not any("in step" in warning for warning in calibrate(SPEC.generate().observations).warnings)
+
+
 def test_a_known_read_out_time_is_taken_into_account():
     session = replace(QUIET, clocks=Clocks(readout_s=0.015)).generate()
     known = replace(session.observations, readout_s=0.015)

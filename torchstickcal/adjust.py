@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 
 import torch
 from torch import Tensor
@@ -173,10 +174,10 @@ class Adjuster:
         """The clocks' offsets by the motion in the images."""
         return search_offsets(*self._as_told())
 
-    @property
+    @cached_property
     def out_of_step(self) -> bool:
         """Whether the cameras' frames clearly do not belong together as told, by the motion in the images."""
-        return out_of_step(*self._as_told())
+        return "time_offset" in self.refinable and out_of_step(*self._as_told())
 
     def _as_told(self) -> tuple[Measurements, float]:
         """The keypoints on the clocks as told, and the largest offset that is looked for, frames."""

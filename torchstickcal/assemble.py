@@ -19,6 +19,7 @@ _CONTRADICTED_SIGMAS = 4.0
 _CONTRADICTED_SHARE = 0.005
 _CONTRADICTED_FRAMES = 0.02
 _OPEN_SHARE = 0.5
+_OUT_OF_STEP = "the cameras do not seem to be in step: other frames fit together better than those told. Refine time_offset."
 
 
 def assemble(
@@ -27,6 +28,7 @@ def assemble(
     covariance: Tensor | None,
     check: CameraCheck,
     clocks: ClockEstimate | None,
+    out_of_step: bool,
     seconds: Mapping[str, float],
 ) -> Calibration:
     """The calibration of one session.
@@ -37,6 +39,7 @@ def assemble(
         covariance: of the tangents of the cameras and of their further unknowns, (1, ...); None where no stage adjusted them.
         check: what the data say of lenses and clocks there.
         clocks: what a search for the clocks has found; None without one.
+        out_of_step: whether the motion says that clocks that were taken as told are frames apart.
         seconds: time by step.
     """
     frames, measurements, result = reached.frames, reached.measurements, reached.result
@@ -88,6 +91,7 @@ def assemble(
         warnings=(
             *_warnings(observations, measurements, inliers, sigma_px),
             *_lens_warnings(observations, ratio, ratio_std, lens_std[:, 0] > 0),
+            *([_OUT_OF_STEP] if out_of_step else []),
             *timing.warnings(),
             *_undetermined(observations, measurements, stds, clocks),
         ),

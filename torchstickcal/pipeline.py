@@ -70,8 +70,9 @@ def _calibrated(observations: Observations, settings: Config, callback: Callback
     check = adjuster.check(adjusted)
     reached = adjuster.held(adjusted)
     covariance = adjusted.covariance(reached.result.sigma_px)
+    doubtful = settings.synchronise and "time_offset" not in reached.refined and adjuster.out_of_step
     seconds = adjuster.seconds | {"total": time.perf_counter() - began}
-    calibration = assemble(observations, reached, covariance, check, clocks, seconds)
+    calibration = assemble(observations, reached, covariance, check, clocks, doubtful, seconds)
     if callback:
         callback.on_end(calibration)
     return calibration
