@@ -9,7 +9,7 @@ from typing import Any, Literal, Protocol
 
 from torchstickcal.adjust import Adjuster, Adjustment
 from torchstickcal.assemble import assemble
-from torchstickcal.camera_check import with_refinements
+from torchstickcal.camera_check import CameraCheck, with_refinements
 from torchstickcal.camera_unknowns import CLOCKS
 from torchstickcal.config import Config, Refine, load_config, with_refine
 from torchstickcal.errors import ObservationError, RigError
@@ -65,9 +65,9 @@ def _calibrated(observations: Observations, settings: Config, callback: Callback
     began = time.perf_counter()
     adjuster = Adjuster(observations, settings, callback.on_iteration if callback else unheard)
     adjusted, clocks = _synchronised(adjuster, settings)
-    if settings.refine == "auto":
-        adjusted = _chosen(adjuster, settings, adjusted)
     check = adjuster.check(adjusted)
+    if settings.refine == "auto":
+        adjusted, check = _chosen(adjuster, settings, adjusted, check)
     reached = adjuster.held(adjusted)
     covariance = adjusted.covariance(reached.result.sigma_px)
     doubtful = settings.synchronise and "time_offset" not in reached.refined and adjuster.out_of_step
@@ -121,16 +121,16 @@ def _at_offsets(adjuster: Adjuster, refined: Sequence[str], clocks: ClockEstimat
     return found
 
 
-def _chosen(adjuster: Adjuster, settings: Config, adjusted: Adjustment) -> Adjustment:
-    """The session adjusted with what the data contradict among the unknowns, the most contradicted first."""
+def _chosen(adjuster: Adjuster, settings: Config, adjusted: Adjustment, check: CameraCheck) -> tuple[Adjustment, CameraCheck]:
+    """The session adjusted with what the data contradict among the unknowns, the most contradicted first, and checked again."""
     free, failed = _free(adjuster, settings), []
-    while choice := adjuster.check(adjusted).wanted(free, adjusted.refined, failed):
+    while choice := check.wanted(free, adjusted.refined, failed):
         refined = adjuster.again(adjusted, with_refinements(adjusted.refined, choice))
         if refined.converged:
-            adjusted = refined
+            adjusted, check = refined, adjuster.check(refined)
         else:
             failed.append(choice)
-    return adjusted
+    return adjusted, check
 
 
 def _free(adjuster: Adjuster, settings: Config) -> set[str]:
