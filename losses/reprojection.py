@@ -126,12 +126,10 @@ class ReprojectionLoss(CameraPointLoss):
         image_step: ImageStep | None = None,
     ) -> Tensor:
         x, y, z = points_cam.unbind(-2)
-        dx, dy, dz = moved_cam.unbind(-2)
         inverse_depth = inverse_depths(z.where(information > 0, 1.0))
         u, v = x * inverse_depth, y * inverse_depth
-        du, dv = (dx - u * dz) * inverse_depth, (dy - v * dz) * inverse_depth
         m = cameras.pixels_with_jacobian(u, v)
-        moved_x, moved_y = m.dx_du * du + m.dx_dv * dv, m.dy_du * du + m.dy_dv * dv
+        moved_x, moved_y = m.moved(u, v, inverse_depth, moved_cam)
         if image_step is not None:
             own_x, own_y = image_step(u, v, m)
             moved_x, moved_y = moved_x + own_x, moved_y + own_y

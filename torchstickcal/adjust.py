@@ -224,9 +224,8 @@ class Adjuster:
         seen, old = self._refining(adjustment.seen, refined), adjustment.result.state
         state = _starting(seen, old, adjustment.seen.unknowns)
         result = adjustment.result._replace(state=state)
-        measurements, records = _resting(adjustment.frames, seen), list(adjustment.records)
-        if adjustment.apart:
-            measurements = _placed(adjustment, seen, state)
+        measurements = _placed(adjustment, seen, state) if adjustment.apart else _resting(adjustment.frames, seen)
+        records = list(adjustment.records)
         if set(refined) - set(adjustment.refined) - CLOCKS:
             records = []
             result = self._through(self._adjusting, measurements, state, records)

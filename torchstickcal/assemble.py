@@ -100,14 +100,11 @@ def assemble(
 
 def _residuals(reached: Adjustment) -> Tensor:
     """Projections minus keypoints (C, G, P, 2) at the common frames, pixels; NaN where not seen or the point is not known."""
-    measurements, state = reached.measurements, reached.result.state
-    cameras, known = measurements.cameras_at(state), reached.result.inliers.any(1, keepdim=True)
+    measurements = reached.measurements
+    known = measurements.visible & reached.result.inliers.any(1, keepdim=True)
     residuals = torch.empty_like(measurements.pixels, dtype=torch.float64)
-    for columns in measurements.chunks():
-        x, y, z = state.in_cameras(columns, measurements.pixels.dtype).unbind(-2)
-        projected = torch.stack(cameras.project_components(x, y, z), dim=-2)
-        seen = (measurements.visible & known)[..., columns].unsqueeze(-2)
-        residuals[..., columns] = (projected - measurements.pixels_at(state, columns)).double().where(seen, torch.nan)
+    for columns, found, _ in measurements.residuals(reached.result.state):
+        residuals[..., columns] = found.double().where(known[..., columns].unsqueeze(-2), torch.nan)
     return measurements.by_frame(residuals[0]).movedim(1, -1)
 
 

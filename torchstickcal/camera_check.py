@@ -116,12 +116,12 @@ class CameraCheck:
         for names in _CHOICES:
             if names in failed or not set(names) <= set(allowed) or with_refinements(refined, names) == tuple(refined):
                 continue
-            gain = self.gain(names)
+            gain = self._gain(names)
             if gain > best:
                 best, choice = gain, names
         return choice
 
-    def gain(self, names: tuple[str, ...]) -> float:
+    def _gain(self, names: tuple[str, ...]) -> float:
         """Decrease of the cost that a choice promises, less a price for each of its parameters.
 
         Residuals that are alike from frame to frame count as the fewer independent ones that they are worth.

@@ -196,7 +196,7 @@ REFINEMENTS = {
 }
 """What may be refined, by the name that configurations use."""
 
-CLOCKS = {"time_offset", "readout"}
+CLOCKS = {name for name, refinement in REFINEMENTS.items() if any(isinstance(kind, ClockKind) for kind in refinement.kinds)}
 """Those that say when a camera looked."""
 
 

@@ -41,6 +41,12 @@ class PixelMap(NamedTuple):
     dy_du: Tensor
     dy_dv: Tensor
 
+    def moved(self, u: Tensor, v: Tensor, inverse_depth: Tensor, step: Tensor) -> tuple[Tensor, Tensor]:
+        """How the pixels (x, y) move where the points there, in the cameras' frames, move by a step (..., C, 3, N)."""
+        dx, dy, dz = step.unbind(-2)
+        du, dv = (dx - u * dz) * inverse_depth, (dy - v * dz) * inverse_depth
+        return self.dx_du * du + self.dx_dv * dv, self.dy_du * du + self.dy_dv * dv
+
 
 @dataclass(frozen=True)
 class Intrinsics:

@@ -211,7 +211,7 @@ class CalibrationLayer(nn.Module):
         """Run the stages on sessions side by side, then tie the last ones to what was given."""
         known = rulers([session.observations for session in begun], self.config)
         as_seen = Measurements.stack([session.seen for session in begun])
-        measurements, decisive = self._through(as_seen, given.exposures, begun, known, warm)
+        measurements, decisive = self._through(given, as_seen, begun, known, warm)
         data = given.measurements(as_seen, measurements)
         tied = self._tied(data, decisive, known)
         last = decisive[-1][1]
@@ -246,7 +246,7 @@ class CalibrationLayer(nn.Module):
 
     @torch.no_grad()
     def _through(
-        self, seen: Measurements, exposures: Exposures, begun: list[_Begun], known: Sequence[Ruler], warm: bool
+        self, given: _Given, seen: Measurements, begun: list[_Begun], known: Sequence[Ruler], warm: bool
     ) -> tuple[Measurements, list[tuple[Stage, StageResult]]]:
         """The keypoints as the stages leave them, on one clock where clocks are to be found, and the results of the last stage
         that adjusts the cameras and of those after it."""
@@ -263,7 +263,7 @@ class CalibrationLayer(nn.Module):
             result = run(name, stage, measurements, state)
             if number == last_free and measurements.motion is not None:
                 again = partial(run, CLOCK_STAGE, stage)
-                measurements, result = on_one_clock(seen, exposures, measurements, result, again)
+                measurements, result = on_one_clock(seen, given.exposures, measurements, result, again)
             reached.append((stage, result))
             state = result.state
         return measurements, reached[last_free - len(stages) :]
@@ -333,7 +333,8 @@ class _Given:
     """(B, C, ...), float64"""
     lengths_m: Tensor
     """(B, S), float64"""
-    exposures: Exposures
+    image_size: Tensor | None
+    """(B, C, 2), width and height, pixels"""
     unknowns: CameraUnknowns | None = None
     """what is to be found of lenses and clocks"""
 
@@ -368,7 +369,7 @@ class _Given:
             None if confidence is None else confidence.reshape(keypoints.shape[:-1]),
             Intrinsics(_expanded("intrinsics", lens.matrix, (sessions, cameras, 3, 3), keypoints), distortion, lens.fisheye),
             _expanded("stick_lengths", stick_lengths, (sessions, len(sticks)), keypoints),
-            Exposures.together(keypoints.detach(), image_size),
+            image_size,
         )
 
     def of_sessions(self, chosen: list[int]) -> _Given:
@@ -379,9 +380,14 @@ class _Given:
             confidence,
             self.cameras[chosen],
             self.lengths_m[chosen],
-            self.exposures[chosen],
+            None if self.image_size is None else self.image_size[chosen],
             self.unknowns and self.unknowns[chosen],
         )
+
+    @property
+    def exposures(self) -> Exposures:
+        """When the keypoints were exposed, as far as told."""
+        return Exposures.together(self.keypoints.detach(), self.image_size)
 
     @property
     def clocked(self) -> bool:

@@ -55,12 +55,10 @@ def residual_correlation(measurements: Measurements, state: State, sigma_px: Ten
         state: the solution.
         sigma_px: noise of each point's keypoints, (B, P).
     """
-    m, cameras = measurements, measurements.cameras_at(state)
+    m = measurements
     alike, squares = torch.zeros(2, dtype=torch.float64, device=state.points.device)
-    for columns in m.chunks():
-        x, y, z = state.in_cameras(columns, m.pixels.dtype).unbind(-2)
+    for columns, residuals, _ in m.residuals(state):
         seen = m.visible[..., columns].unsqueeze(-2)
-        residuals = torch.stack(cameras.project_components(x, y, z), dim=-2) - m.pixels_at(state, columns)
         residuals = residuals.where(seen, torch.nan).double().unflatten(-1, (-1, m.points_per_frame))
         residuals = residuals / sigma_px[:, None, None, None]
         before, after = residuals[..., :-1, :], residuals[..., 1:, :]

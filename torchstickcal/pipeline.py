@@ -92,20 +92,20 @@ def _synchronised(adjuster: Adjuster, settings: Config) -> tuple[Adjustment, Clo
     searchable = "time_offset" in (_free(adjuster, settings) if settings.refine == "auto" else refined)
     clocks: ClockEstimate | None = None
     found: list[Adjustment] = []
+    failure: RigError | None = None
     if searchable and adjuster.out_of_step:
         clocks = adjuster.search()
         found += _at_offsets(adjuster, refined, clocks)
     if not any(adjustment.fits for adjustment in found):
         try:
             found.append(adjuster.begin(lenses))
-        except RigError:
-            if not (searchable or found):
-                raise
+        except RigError as error:
+            failure = error
     if searchable and clocks is None and not any(adjustment.fits for adjustment in found):
         clocks = adjuster.search()
         found += _at_offsets(adjuster, refined, clocks)
-    if not found:
-        found.append(adjuster.begin(lenses))
+    if not found and failure is not None:
+        raise failure
     best = min(found, key=lambda adjustment: adjustment.median_residual)
     return best if set(refined) <= set(best.refined) else adjuster.again(best, refined), clocks
 

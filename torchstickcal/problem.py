@@ -7,7 +7,7 @@ is a batch of one.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
 
@@ -142,15 +142,18 @@ class Measurements:
         Infinite where a keypoint is not seen or its point lies behind the camera.
         """
         squared = torch.empty_like(self.confidence)
+        for columns, residuals, depth in self.residuals(state):
+            confidence = self.confidence[..., columns]
+            distance = residuals.square().sum(-2) * confidence
+            squared[..., columns] = distance.where((confidence > 0) & (depth > 0), torch.inf)
+        return squared
+
+    def residuals(self, state: State) -> Iterator[tuple[slice, Tensor, Tensor]]:
+        """Projections minus keypoints (B, C, 2, n), pixels, and the points' depths (B, C, n), metres, by chunks of columns."""
         cameras = self.cameras_at(state)
         for columns in self.chunks():
-            x, y, z = state.in_cameras(columns, squared.dtype).unbind(-2)
-            px, py = cameras.project_components(x, y, z)
-            u, v = self.pixels_at(state, columns).unbind(-2)
-            confidence = self.confidence[..., columns]
-            distance = ((px - u).square() + (py - v).square()) * confidence
-            squared[..., columns] = distance.where((confidence > 0) & (z > 0), torch.inf)
-        return squared
+            x, y, z = state.in_cameras(columns, self.pixels.dtype).unbind(-2)
+            yield columns, torch.stack(cameras.project_components(x, y, z), dim=-2) - self.pixels_at(state, columns), z
 
     def cameras_at(self, state: State) -> Intrinsics:
         """The cameras as a state has them, in the dtype of the pixels."""

@@ -120,16 +120,16 @@ def _steady(points: Tensor, variance: Tensor, views: Tensor) -> Tensor:
     A point that two cameras see has no third to contradict a wrong keypoint; its neighbours do.
     """
     seen = points.where(variance.isfinite(), torch.nan)
-    near = dict(zip(_NEIGHBOURS, _around(seen, _NEIGHBOURS), strict=True))
+    near = dict(zip(_NEIGHBOURS, around(seen, _NEIGHBOURS), strict=True))
     middles = [(near[-k] + near[k]) / 2 for k in (1, 2, 3)]
     onward = [2 * near[k] - near[2 * k] for k in (-1, 1)]
     away = (seen - torch.stack([*middles, *onward]).nanmedian(0).values).square().sum(0).sqrt()
-    usual = _around(away, range(-_REACHES[1], _REACHES[1] + 1)).nanmedian(0).values
+    usual = around(away, range(-_REACHES[1], _REACHES[1] + 1)).nanmedian(0).values
     limit = torch.where(views > 2, _UNSTEADY_CONFIRMED, _UNSTEADY)
     return ~(away > limit * (usual + (3 * variance).sqrt()))
 
 
-def _around(values: Tensor, steps: Sequence[int]) -> Tensor:
+def around(values: Tensor, steps: Sequence[int]) -> Tensor:
     """Values (..., F, P) some frames away from each, one after another, NaN beyond the ends."""
     widest, frames = max(map(abs, steps)), values.shape[-2]
     padded = torch.nn.functional.pad(values, (0, 0, widest, widest), value=torch.nan)

@@ -78,10 +78,6 @@ class Exposures:
             rows = (ordinates / height[..., None, None] - 0.5).nan_to_num().clamp(-0.5, 0.5)
         return Exposures(torch.zeros_like(rows).flatten(2), rows.flatten(2))
 
-    def __getitem__(self, sessions: slice | list[int]) -> Exposures:
-        """Those of some of the sessions."""
-        return Exposures(self.delays[sessions], self.rows[sessions])
-
     def resting(self, measurements: Measurements) -> Measurements:
         """Measurements with clocks among their unknowns as if nothing moved: where trajectories are not known yet."""
         assert measurements.unknowns is not None
@@ -132,9 +128,7 @@ def _seen(
     inverse_depth = inverse_depths(z)
     u, v = x * inverse_depth, y * inverse_depth
     m = cameras.pixels_with_jacobian(u, v)
-    dx, dy, dz = (pose[0] @ velocities).unbind(1)
-    du, dv = (dx - u * dz) * inverse_depth, (dy - v * dz) * inverse_depth
-    moving = torch.stack([m.dx_du * du + m.dx_dv * dv, m.dy_du * du + m.dy_dv * dv], dim=1)
+    moving = torch.stack(m.moved(u, v, inverse_depth, pose[0] @ velocities), dim=1)
     return torch.stack([m.x, m.y], dim=1), inverse_depth, moving
 
 

@@ -17,6 +17,7 @@ from torch.nn.functional import pad
 
 from torchstickcal.problem import Measurements
 from torchstickcal.synchronise.epipolar import Agreement, Tracks
+from torchstickcal.trajectories import around
 
 _ROUNDS = 3
 _MAX_SWEEPS = 10
@@ -117,15 +118,10 @@ def _most_motion(places: Tensor, weights: Tensor, frames: int) -> tuple[Tensor, 
 def _steady(places: Tensor, weights: Tensor, noise_px: float) -> Tensor:
     """Whether a keypoint is near the median of its neighbours in time, for its pace (Hampel's filter), (C, F, P)."""
     seen = places.where(weights[:, None] > 0, torch.nan)
-    away = (seen - _median_around(seen, [k for k in range(-_NEAR_FRAMES, _NEAR_FRAMES + 1) if k])).square().sum(1).sqrt()
-    return away <= _CUT * (_median_around(away, range(-_AROUND_FRAMES, _AROUND_FRAMES + 1)) + noise_px)
-
-
-def _median_around(values: Tensor, steps: Iterable[int]) -> Tensor:
-    """Median of the values (..., F, P) some frames away from each; NaN does not count."""
-    widest, frames = max(steps), values.shape[-2]
-    padded = pad(values, (0, 0, widest, widest), value=torch.nan)
-    return torch.stack([padded[..., widest + k : widest + k + frames, :] for k in steps]).nanmedian(0).values
+    near = around(seen, [k for k in range(-_NEAR_FRAMES, _NEAR_FRAMES + 1) if k]).nanmedian(0).values
+    away = (seen - near).square().sum(1).sqrt()
+    usual = around(away, range(-_AROUND_FRAMES, _AROUND_FRAMES + 1)).nanmedian(0).values
+    return away <= _CUT * (usual + noise_px)
 
 
 def _joint_offsets(tracks: Tracks, reach: int, noise_px: float) -> tuple[Pairs, Tensor, Tensor]:
