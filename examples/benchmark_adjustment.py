@@ -24,10 +24,11 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from torchstickcal import Extrinsics, Intrinsics, se3
+from torchstickcal import Extrinsics, Intrinsics
+from torchstickcal.geometry import se3
 from torchstickcal.losses import Loss, ReprojectionLoss, SmoothnessLoss, StickLengthLoss
-from torchstickcal.objective import Objective
-from torchstickcal.problem import Measurements, State
+from torchstickcal.model.measurements import Measurements, State
+from torchstickcal.model.objective import Objective
 from torchstickcal.solvers import Termination, gauss_newton
 from torchstickcal.workers import on_worker
 

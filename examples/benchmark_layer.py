@@ -14,10 +14,10 @@ import torch
 
 from torchstickcal import CalibrationLayer, Config, load_config
 from torchstickcal.losses import ReprojectionLoss, StickLengthLoss
-from torchstickcal.objective import Objective
-from torchstickcal.problem import Measurements, State
+from torchstickcal.model.measurements import Measurements, State
+from torchstickcal.model.objective import Objective
 from torchstickcal.simulate import Noise, golf_session
-from torchstickcal.solvers.normal_equations import NormalEquations, Step
+from torchstickcal.solvers.elimination.normal_equations import NormalEquations, Step
 from torchstickcal.workers import on_worker
 
 CAMERAS, FRAMES, POINTS = 6, 50, 21

@@ -25,10 +25,10 @@ from torchstickcal import Calibration, Observations, calibrate
 from torchstickcal.benchmark.bound import camera_bound
 from torchstickcal.benchmark.cases import Case
 from torchstickcal.metrics import pose_errors
+from torchstickcal.pipeline.synchronise import on_common_frames
 from torchstickcal.simulate import Clocks, Lens, SessionSpec, SimulatedSession
 from torchstickcal.simulate.regimes import DetectorNoise, Gaps, GaussianNoise
 from torchstickcal.simulate.session import Assumptions
-from torchstickcal.synchronise import on_common_frames
 
 SPORTS = ("golf", "baseball", "hockey", "kendo", "wand")
 BARREL = Lens(distortion=(-0.2, 0.0, 0.0, 0.0, 0.0))

@@ -45,7 +45,7 @@ from torch.nn.parallel import DistributedDataParallel
 from torch.utils.tensorboard import SummaryWriter
 
 from torchstickcal import CalibrationLayer, Config, load_config
-from torchstickcal.layer import LayerResult
+from torchstickcal.layer.layer import LayerResult
 from torchstickcal.losses import reprojection_residuals
 from torchstickcal.metrics import pose_errors
 

@@ -7,7 +7,8 @@ keypoints by Adam; a network that predicts the keypoints or the points could sta
 import torch
 from torch import nn
 
-from torchstickcal import Extrinsics, se3
+from torchstickcal import Extrinsics
+from torchstickcal.geometry import se3
 from torchstickcal.losses import Cauchy, ReprojectionLoss, SmoothnessLoss, StickLengthLoss
 from torchstickcal.metrics import pose_errors
 from torchstickcal.simulate import Noise, golf_session

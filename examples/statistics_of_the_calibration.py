@@ -29,17 +29,18 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from torchstickcal import Calibration, Observations, calibrate, se3
+from torchstickcal import Calibration, Observations, calibrate
 from torchstickcal.config import InitialiseSettings
-from torchstickcal.initialise import triangulated
+from torchstickcal.geometry import se3
 from torchstickcal.losses import Loss, ReprojectionLoss, StickLengthLoss
 from torchstickcal.metrics import rotation_angle
-from torchstickcal.objective import Objective
-from torchstickcal.problem import Measurements, State
+from torchstickcal.model.measurements import Measurements, State
+from torchstickcal.model.objective import Objective
+from torchstickcal.pipeline.initialise import triangulated
 from torchstickcal.simulate import Noise, SessionSpec, SimulatedSession
+from torchstickcal.solvers.elimination.normal_equations import NormalEquations
 from torchstickcal.solvers.newton import polish
-from torchstickcal.solvers.normal_equations import NormalEquations
-from torchstickcal.uncertainty import centre_covariances, point_covariances
+from torchstickcal.solvers.uncertainty import centre_covariances, point_covariances
 
 SIGMA_PX = 1.0
 EXACT_M = 1e-5

@@ -16,7 +16,7 @@ from typing import NamedTuple, Self
 import torch
 from torch import Tensor, nn
 
-from torchstickcal.cameras import Intrinsics, PixelMap
+from torchstickcal.geometry.cameras import Intrinsics, PixelMap
 from torchstickcal.losses.robust import Quadratic, RobustKernel
 
 UnknownColumns = Callable[[Tensor, Tensor, PixelMap], tuple[Tensor, Tensor]]

@@ -5,9 +5,9 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from torchstickcal.cameras import Intrinsics, PixelMap, inverse_depths
+from torchstickcal.geometry.cameras import Intrinsics, PixelMap, inverse_depths
+from torchstickcal.geometry.symmetric import symmetric_product
 from torchstickcal.losses.base import CameraPointLoss, CameraPointTerms, ImageStep, UnknownColumns, UnknownTerms
-from torchstickcal.symmetric import symmetric_product
 
 
 def reprojection_residuals(

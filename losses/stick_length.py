@@ -5,8 +5,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from torchstickcal.geometry.symmetric import DIAGONAL, outer
 from torchstickcal.losses.base import PairLoss, PairTerms
-from torchstickcal.symmetric import DIAGONAL, outer
 
 _MIN_LENGTH_M = 1e-6
 

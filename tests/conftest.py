@@ -9,8 +9,8 @@ import pytest
 import torch
 
 from torchstickcal.io import Truth
+from torchstickcal.model.measurements import Measurements, State
 from torchstickcal.observations import Observations
-from torchstickcal.problem import Measurements, State
 from torchstickcal.simulate import Noise, golf_session
 
 _DATA = Path(os.environ.get("TORCHSTICKCAL_DATA", Path(__file__).parents[2] / "shared" / "data"))

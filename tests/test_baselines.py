@@ -9,16 +9,16 @@ import pytest
 import torch
 
 from torchstickcal import CalibrationError, Observations
-from torchstickcal.baselines import BASELINES, BONES, Inputs, bone_lengths, limb_orientations
-from torchstickcal.baselines.base import MissingInputError
-from torchstickcal.baselines.frame_adjustment import CameraPrior, adjust
-from torchstickcal.baselines.kineo import RelatedPair, average_rotations, average_translations, refine_by_sampson
+from torchstickcal.benchmark.baselines import BASELINES, BONES, Inputs, bone_lengths, limb_orientations
+from torchstickcal.benchmark.baselines.base import MissingInputError
+from torchstickcal.benchmark.baselines.frame_adjustment import CameraPrior, adjust
+from torchstickcal.benchmark.baselines.kineo import RelatedPair, average_rotations, average_translations, refine_by_sampson
+from torchstickcal.geometry.se3 import exp
 from torchstickcal.io import Truth
 from torchstickcal.losses import ReprojectionLoss, StickLengthLoss
 from torchstickcal.metrics import pose_errors, rotation_angle
-from torchstickcal.objective import Objective
-from torchstickcal.problem import Measurements, State
-from torchstickcal.se3 import exp
+from torchstickcal.model.measurements import Measurements, State
+from torchstickcal.model.objective import Objective
 from torchstickcal.simulate import Cube, CubeViews, golf_session
 from torchstickcal.simulate.rigs import CameraRig
 from torchstickcal.simulate.skeleton import STANDING_HEIGHT_M

@@ -9,13 +9,13 @@ import torch
 from kornia.geometry.liegroup import Se3
 from torch import Tensor
 
-from torchstickcal.camera_unknowns import REFINEMENTS, CameraUnknowns, ImageMotion
-from torchstickcal.cameras import Intrinsics
+from torchstickcal.geometry.cameras import Intrinsics
 from torchstickcal.losses import Cauchy, GemanMcClure, Loss, ReprojectionLoss, SmoothnessLoss, StickLengthLoss
 from torchstickcal.losses.reprojection import reprojection_residuals
-from torchstickcal.objective import Objective
-from torchstickcal.problem import Measurements, State
-from torchstickcal.solvers.normal_equations import NormalEquations
+from torchstickcal.model.measurements import Measurements, State
+from torchstickcal.model.objective import Objective
+from torchstickcal.model.unknowns import REFINEMENTS, CameraUnknowns, ImageMotion
+from torchstickcal.solvers.elimination.normal_equations import NormalEquations
 
 CHOICES = [(name,) for name in REFINEMENTS] + [
     ("focal", "radial", "time_offset"),

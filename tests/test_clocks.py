@@ -10,8 +10,8 @@ import torch
 
 from torchstickcal import Calibration, ConfigError, ObservationError, Observations, calibrate
 from torchstickcal.metrics import pose_errors
-from torchstickcal.noise import residual_correlation
-from torchstickcal.problem import Measurements, State
+from torchstickcal.model.measurements import Measurements, State
+from torchstickcal.model.noise import residual_correlation
 from torchstickcal.simulate import Clocks, SessionSpec, SimulatedSession
 from torchstickcal.simulate.regimes import GaussianNoise
 from torchstickcal.simulate.session import Assumptions

@@ -6,13 +6,13 @@ import pytest
 import torch
 from torch import Tensor
 
-from torchstickcal import se3
-from torchstickcal.cameras import Intrinsics
-from torchstickcal.problem import Measurements
-from torchstickcal.solvers.cross_blocks import cross_rows, symmetric_times
-from torchstickcal.solvers.parts import Couplings, Part, parts
-from torchstickcal.solvers.track_elimination import BlockTridiagonal
-from torchstickcal.symmetric import expand, inverse_diagonal
+from torchstickcal.geometry import se3
+from torchstickcal.geometry.cameras import Intrinsics
+from torchstickcal.geometry.symmetric import expand, inverse_diagonal
+from torchstickcal.model.measurements import Measurements
+from torchstickcal.solvers.elimination.cross_blocks import cross_rows, symmetric_times
+from torchstickcal.solvers.elimination.parts import Couplings, Part, parts
+from torchstickcal.solvers.elimination.tracks import BlockTridiagonal
 
 P = 5
 PAIRS = torch.tensor([[3, 4], [1, 0]])
@@ -115,7 +115,7 @@ def test_points_alone():
 @pytest.mark.parametrize("frames", [3, 4, 5, 8, 11])
 @pytest.mark.parametrize("together", [1, 1000])
 def test_tracks(frames: int, together: int, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr("torchstickcal.solvers.parts._TRACK_POINTS", together)
+    monkeypatch.setattr("torchstickcal.solvers.elimination.parts._TRACK_POINTS", together)
     dense, blocks, coupling, next_frame, second_frame = system(frames, smooth=True)
     by_point = dense.reshape(frames, P, 3, frames, P, 3)
     found = parts(session(frames, PAIRS), Couplings(coupling[None], next_frame[None], second_frame[None]))

@@ -5,7 +5,8 @@ from __future__ import annotations
 import pytest
 import torch
 
-from torchstickcal import Extrinsics, ObservationError, se3
+from torchstickcal import Extrinsics, ObservationError
+from torchstickcal.geometry import se3
 from torchstickcal.losses import ReprojectionLoss
 
 

@@ -10,12 +10,12 @@ import torch
 
 from torchstickcal import Observations, RigError, calibrate, metrics
 from torchstickcal.config import InitialiseSettings
-from torchstickcal.initialise import initialise
-from torchstickcal.initialise.graph import Edge, propagate, spanning_tree
-from torchstickcal.initialise.pairs import Pair, RelativePose, relate
-from torchstickcal.initialise.triangulate import triangulate
-from torchstickcal.initialise.views import Views
-from torchstickcal.problem import Measurements
+from torchstickcal.model.measurements import Measurements
+from torchstickcal.pipeline.initialise import initialise
+from torchstickcal.pipeline.initialise.graph import Edge, propagate, spanning_tree
+from torchstickcal.pipeline.initialise.pairs import Pair, RelativePose, relate
+from torchstickcal.pipeline.initialise.triangulate import triangulate
+from torchstickcal.pipeline.initialise.views import Views
 from torchstickcal.simulate import Noise, SessionSpec, golf_session
 
 

@@ -11,12 +11,12 @@ import torch
 from torch import Tensor
 
 from torchstickcal import CalibrationLayer, ObservationError, calibrate
-from torchstickcal.layer import LayerResult
+from torchstickcal.layer.layer import LayerResult
 from torchstickcal.metrics import pose_errors
-from torchstickcal.problem import Measurements
+from torchstickcal.model.measurements import Measurements
+from torchstickcal.pipeline.synchronise import Exposures, common_clock
 from torchstickcal.simulate import Clocks, SessionSpec, SimulatedSession
 from torchstickcal.simulate.regimes import GaussianNoise
-from torchstickcal.synchronise import Exposures, common_clock
 
 FPS = 60.0
 SPEC = SessionSpec("clocks", "hockey", 5, 4, 40, FPS, "ring", regimes=(GaussianNoise(1.0),), clocks=Clocks(0.5 / FPS))

@@ -11,9 +11,9 @@ import torch
 from torchstickcal import Calibration, CalibrationLayer, Observations, calibrate
 from torchstickcal.benchmark.bound import camera_bound
 from torchstickcal.benchmark.cases import Case
-from torchstickcal.camera_check import with_refinements
 from torchstickcal.errors import ConfigError, ObservationError
 from torchstickcal.metrics import pose_errors
+from torchstickcal.pipeline.check import with_refinements
 from torchstickcal.simulate import Lens, SessionSpec, SimulatedSession
 from torchstickcal.simulate.regimes import GaussianNoise
 from torchstickcal.simulate.session import Assumptions

@@ -7,7 +7,7 @@ import math
 import pytest
 import torch
 
-from torchstickcal import se3
+from torchstickcal.geometry import se3
 from torchstickcal.metrics import align, pose_errors, rotation_angle
 
 

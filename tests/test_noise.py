@@ -6,8 +6,8 @@ import pytest
 import torch
 
 from torchstickcal import calibrate
-from torchstickcal.noise import estimate_acceleration_m, estimate_sigma_px
-from torchstickcal.problem import Measurements, State
+from torchstickcal.model.measurements import Measurements, State
+from torchstickcal.model.noise import estimate_acceleration_m, estimate_sigma_px
 from torchstickcal.simulate import Noise, golf_session
 
 

@@ -19,9 +19,9 @@ from torchstickcal.losses import (
     second_differences,
 )
 from torchstickcal.losses.reprojection import reprojection_residuals
-from torchstickcal.objective import Objective
-from torchstickcal.problem import Measurements, State
-from torchstickcal.solvers.normal_equations import NormalEquations
+from torchstickcal.model.measurements import Measurements, State
+from torchstickcal.model.objective import Objective
+from torchstickcal.solvers.elimination.normal_equations import NormalEquations
 
 LOSSES: dict[str, dict[str, Loss]] = {
     "reprojection": {"reprojection": ReprojectionLoss(2.0, kernel=Cauchy(2.0))},
@@ -183,10 +183,10 @@ def test_parts_add_up(
     measurements, state = disturbed
     objective = Objective(measurements, losses)
     whole = NormalEquations(objective, state, True, 1e-3).step()
-    monkeypatch.setattr("torchstickcal.problem._CHUNK_KEYPOINTS", {"cpu": 200})
-    monkeypatch.setattr("torchstickcal.solvers.parts._TRACK_POINTS", 90)
+    monkeypatch.setattr("torchstickcal.model.measurements._CHUNK_KEYPOINTS", {"cpu": 200})
+    monkeypatch.setattr("torchstickcal.solvers.elimination.parts._TRACK_POINTS", 90)
     if not kept:
-        monkeypatch.setattr("torchstickcal.solvers.normal_equations._KEPT_BYTES", 0)
+        monkeypatch.setattr("torchstickcal.solvers.elimination.normal_equations._KEPT_BYTES", 0)
     assert len(measurements.chunks()) > 10
     parts = NormalEquations(objective, state, True, 1e-3).step()
     torch.testing.assert_close(parts.cameras, whole.cameras, rtol=1e-9, atol=1e-12)

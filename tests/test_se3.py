@@ -7,7 +7,7 @@ import torch
 from kornia.geometry.liegroup import Se3, So3
 from torch import Tensor
 
-from torchstickcal import se3
+from torchstickcal.geometry import se3
 
 SCALES = [0.0, 1e-9, 1e-5, 1e-3, 0.5, 2.0, 3.1]
 

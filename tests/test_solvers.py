@@ -6,8 +6,8 @@ import pytest
 import torch
 
 from torchstickcal.losses import Cauchy, GemanMcClure, Loss, ReprojectionLoss, SmoothnessLoss, StickLengthLoss
-from torchstickcal.objective import Objective
-from torchstickcal.problem import Measurements, State
+from torchstickcal.model.measurements import Measurements, State
+from torchstickcal.model.objective import Objective
 from torchstickcal.solvers import IterationRecord, Stop, Termination, solver
 
 LOSSES: dict[str, dict[str, Loss]] = {

@@ -8,12 +8,12 @@ import pytest
 import torch
 
 from torchstickcal import ObservationError, Observations, Stick
-from torchstickcal.problem import Measurements
+from torchstickcal.model.measurements import Measurements
+from torchstickcal.pipeline.synchronise import on_common_frames, search_offsets
+from torchstickcal.pipeline.synchronise.epipolar import Tracks
 from torchstickcal.simulate import Clocks, Noise, SessionSpec
 from torchstickcal.simulate.regimes import DroppedFrames, FrameRates, Gaps, SelfOcclusion
 from torchstickcal.simulate.session import Assumptions
-from torchstickcal.synchronise import on_common_frames, search_offsets
-from torchstickcal.synchronise.epipolar import Tracks
 
 HARD = (Noise(1.5, missing=0.1, outliers=0.05), SelfOcclusion())
 SPEC = SessionSpec("clocks", "golf", 7, 4, 150, 30.0, "ring", regimes=HARD, clocks=Clocks(1.0))

@@ -5,8 +5,8 @@ from __future__ import annotations
 import pytest
 import torch
 
+from torchstickcal.model.trajectories import Trajectories
 from torchstickcal.simulate import SessionSpec
-from torchstickcal.trajectories import Trajectories
 
 HELD = torch.tensor(3)
 """Cameras that hold every point."""

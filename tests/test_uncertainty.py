@@ -5,17 +5,18 @@ from __future__ import annotations
 import pytest
 import torch
 
-from torchstickcal import Calibration, Observations, calibrate, se3
+from torchstickcal import Calibration, Observations, calibrate
 from torchstickcal.config import InitialiseSettings
-from torchstickcal.initialise import triangulated
+from torchstickcal.geometry import se3
 from torchstickcal.io import Truth
 from torchstickcal.losses import ReprojectionLoss, StickLengthLoss
-from torchstickcal.objective import Objective
-from torchstickcal.problem import Measurements, State
+from torchstickcal.model.measurements import Measurements, State
+from torchstickcal.model.objective import Objective
+from torchstickcal.pipeline.initialise import triangulated
 from torchstickcal.simulate import Noise, golf_session
+from torchstickcal.solvers.elimination.normal_equations import NormalEquations
 from torchstickcal.solvers.newton import polish
-from torchstickcal.solvers.normal_equations import NormalEquations
-from torchstickcal.uncertainty import camera_covariance, centre_covariances, point_covariances, relative_scale_std
+from torchstickcal.solvers.uncertainty import camera_covariance, centre_covariances, point_covariances, relative_scale_std
 
 
 def deviation(calibration: Calibration, truth: Truth) -> torch.Tensor:

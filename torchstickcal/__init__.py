@@ -10,40 +10,40 @@ from importlib.metadata import version
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from torchstickcal.cameras import Intrinsics
     from torchstickcal.config import Config, config_names, load_config
     from torchstickcal.errors import CalibrationError, ConfigError, FileFormatError, ObservationError, RigError
     from torchstickcal.extrinsics import Extrinsics
-    from torchstickcal.gradients import GaussNewton, GradientMode, Implicit, Unrolled
-    from torchstickcal.layer import CalibrationLayer, LayerResult
-    from torchstickcal.monitor import TensorBoardMonitor
+    from torchstickcal.geometry.cameras import Intrinsics
+    from torchstickcal.layer.layer import CalibrationLayer, LayerResult
     from torchstickcal.observations import Observations, Stick
-    from torchstickcal.pipeline import Callback, calibrate
+    from torchstickcal.pipeline.calibrate import Callback, calibrate
     from torchstickcal.result import Calibration
+    from torchstickcal.show.tensorboard import TensorBoardMonitor
+    from torchstickcal.solvers.gradients import GaussNewton, GradientMode, Implicit, Unrolled
 
 __version__ = version("torchstickcal")
 
 _HOMES = {
     "Calibration": "result",
     "CalibrationError": "errors",
-    "CalibrationLayer": "layer",
-    "Callback": "pipeline",
+    "CalibrationLayer": "layer.layer",
+    "Callback": "pipeline.calibrate",
     "Config": "config",
     "ConfigError": "errors",
     "Extrinsics": "extrinsics",
     "FileFormatError": "errors",
-    "GaussNewton": "gradients",
-    "GradientMode": "gradients",
-    "Implicit": "gradients",
-    "Intrinsics": "cameras",
-    "LayerResult": "layer",
+    "GaussNewton": "solvers.gradients",
+    "GradientMode": "solvers.gradients",
+    "Implicit": "solvers.gradients",
+    "Intrinsics": "geometry.cameras",
+    "LayerResult": "layer.layer",
     "ObservationError": "errors",
     "Observations": "observations",
     "RigError": "errors",
     "Stick": "observations",
-    "TensorBoardMonitor": "monitor",
-    "Unrolled": "gradients",
-    "calibrate": "pipeline",
+    "TensorBoardMonitor": "show.tensorboard",
+    "Unrolled": "solvers.gradients",
+    "calibrate": "pipeline.calibrate",
     "config_names": "config",
     "load_config": "config",
 }

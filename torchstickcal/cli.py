@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from torchstickcal.config import Config
     from torchstickcal.io import Truth
     from torchstickcal.metrics import PoseErrors
-    from torchstickcal.pipeline import Callback
+    from torchstickcal.pipeline.calibrate import Callback
     from torchstickcal.result import Calibration
     from torchstickcal.solvers import IterationRecord
 
@@ -115,7 +115,7 @@ def _add_config(command: argparse.ArgumentParser) -> None:
 def _calibrate(options: argparse.Namespace) -> int:
     from torchstickcal.config import load_config
     from torchstickcal.io import read_session
-    from torchstickcal.pipeline import calibrate
+    from torchstickcal.pipeline.calibrate import calibrate
 
     _use_threads(options.threads)
     config, refine = _refining(load_config(options.config), options.refine, options.no_sync)
@@ -133,7 +133,7 @@ def _refining(config: Config, option: str | None, no_sync: bool) -> tuple[Config
     Raises:
         CalibrationError: if clocks are both to be found and to be taken as told.
     """
-    from torchstickcal.camera_unknowns import CLOCKS
+    from torchstickcal.model.unknowns import CLOCKS
 
     refine: Any = option
     if option is None:
@@ -249,11 +249,11 @@ def _simulate(options: argparse.Namespace) -> int:
 
 
 def _demo(options: argparse.Namespace) -> int:
-    from torchstickcal.figures import rig_figure
     from torchstickcal.files import atomic_path
     from torchstickcal.io import write_npz
     from torchstickcal.metrics import pose_errors
-    from torchstickcal.pipeline import calibrate
+    from torchstickcal.pipeline.calibrate import calibrate
+    from torchstickcal.show.rig import rig_figure
     from torchstickcal.simulate import Noise, golf_session
 
     print(
@@ -305,14 +305,14 @@ def _use_threads(count: int) -> None:
 def _monitor(log_dir: Path | None) -> Callback | None:
     if log_dir is None:
         return None
-    from torchstickcal.monitor import TensorBoardMonitor
+    from torchstickcal.show.tensorboard import TensorBoardMonitor
 
     return TensorBoardMonitor(log_dir)
 
 
 def _write(calibration: Calibration, folder: Path, provenance: dict[str, str]) -> None:
     from torchstickcal.io import write_camera_toml
-    from torchstickcal.report import summary
+    from torchstickcal.show.report import summary
 
     folder.mkdir(parents=True, exist_ok=True)
     write_camera_toml(folder / CAMERAS_FILE, calibration)
@@ -321,7 +321,7 @@ def _write(calibration: Calibration, folder: Path, provenance: dict[str, str]) -
 
 
 def _show(calibration: Calibration, folder: Path) -> int:
-    from torchstickcal.report import table
+    from torchstickcal.show.report import table
 
     print(table(calibration))
     print(f"\n{CAMERAS_FILE}, {POINTS_FILE}, {REPORT_FILE} in {folder}")

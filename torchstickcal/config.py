@@ -25,7 +25,7 @@ _UNIONS = (types.UnionType, typing.Union)
 
 
 Refine = Literal["focal", "focal_shared", "principal_point", "radial", "time_offset", "readout"]
-"""What may be found of a camera beside its pose, as of :data:`torchstickcal.camera_unknowns.REFINEMENTS`."""
+"""What may be found of a camera beside its pose, as of :data:`torchstickcal.model.unknowns.REFINEMENTS`."""
 
 
 @dataclass(frozen=True)

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from torchstickcal import se3
+from torchstickcal.geometry import se3
 
 _COLLINEAR = 1e-6
 

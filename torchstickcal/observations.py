@@ -10,8 +10,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchstickcal.cameras import Intrinsics
 from torchstickcal.errors import ObservationError
+from torchstickcal.geometry.cameras import Intrinsics
 
 _LONGEST_STICK_M = 10.0
 _SHORTEST_IN_MM = 300.0

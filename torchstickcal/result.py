@@ -13,14 +13,13 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchstickcal import se3
-from torchstickcal.cameras import Intrinsics
 from torchstickcal.errors import FileFormatError
 from torchstickcal.files import atomic_path
+from torchstickcal.geometry import se3
+from torchstickcal.geometry.cameras import Intrinsics
 from torchstickcal.observations import Stick
-from torchstickcal.solvers import IterationRecord, Stop
-from torchstickcal.stages import StageRecord
-from torchstickcal.uncertainty import centre_covariances, point_covariances, relative_scale_std
+from torchstickcal.solvers import IterationRecord, StageRecord, Stop
+from torchstickcal.solvers.uncertainty import centre_covariances, point_covariances, relative_scale_std
 
 _FORMAT = "torchstickcal calibration 4"
 _TENSORS = (
@@ -80,7 +79,7 @@ class Calibration:
     distortion: Tensor | None
     """(C, D), OpenCV's order, likewise"""
     refined: tuple[str, ...]
-    """what was found of the cameras beside their poses, of :data:`torchstickcal.camera_unknowns.REFINEMENTS`"""
+    """what was found of the cameras beside their poses, of :data:`torchstickcal.model.unknowns.REFINEMENTS`"""
     lens_std: Tensor
     """(C, 5), standard deviations of :data:`LENS_PARAMETERS` as found: focal length as a share of it, principal point in
     pixels, k1 and k2; zero where taken as given"""

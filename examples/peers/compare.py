@@ -30,10 +30,10 @@ from torchstickcal import calibrate as calibrate_here
 from torchstickcal.errors import FileFormatError
 from torchstickcal.losses import ReprojectionLoss, StickLengthLoss
 from torchstickcal.metrics import PoseErrors, pose_errors
-from torchstickcal.objective import Objective
-from torchstickcal.problem import Measurements, State
+from torchstickcal.model.measurements import Measurements, State
+from torchstickcal.model.objective import Objective
 from torchstickcal.simulate import SimulatedSession, read_simulated
-from torchstickcal.solvers.normal_equations import NormalEquations
+from torchstickcal.solvers.elimination.normal_equations import NormalEquations
 
 HERE = "torchstickcal"
 SUCCESS = 3.0

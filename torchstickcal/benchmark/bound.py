@@ -7,14 +7,14 @@ from dataclasses import dataclass, replace
 
 import torch
 
-from torchstickcal import se3
 from torchstickcal.benchmark.cases import Case
-from torchstickcal.camera_unknowns import CameraUnknowns
+from torchstickcal.geometry import se3
 from torchstickcal.losses import ReprojectionLoss, StickLengthLoss
 from torchstickcal.metrics import pose_errors
-from torchstickcal.objective import Objective
-from torchstickcal.problem import Measurements, State
-from torchstickcal.solvers.normal_equations import NormalEquations
+from torchstickcal.model.measurements import Measurements, State
+from torchstickcal.model.objective import Objective
+from torchstickcal.model.unknowns import CameraUnknowns
+from torchstickcal.solvers.elimination.normal_equations import NormalEquations
 
 _SIGMA_LENGTH_M = 1e-5
 """As good as exact: what the keypoints of a frame tell about the length is coarser by far."""
@@ -38,7 +38,7 @@ def camera_bound(case: Case, draws: int = 2000, seed: int = 0, unknown: Sequence
         case: a session with true points.
         draws: errors drawn; their mean scatters by some 50 % / sqrt(draws).
         seed: of the draws.
-        unknown: what of the lenses they do not know, as of :data:`torchstickcal.camera_unknowns.REFINEMENTS`.
+        unknown: what of the lenses they do not know, as of :data:`torchstickcal.model.unknowns.REFINEMENTS`.
 
     Returns:
         The bound; None where truth, noise or inliers are not known, or the inliers do not determine the cameras.

@@ -8,11 +8,11 @@ from functools import partial
 
 import torch
 
-from torchstickcal.baselines import BASELINES, Estimate, Inputs, bone_lengths, limb_orientations
+from torchstickcal.benchmark.baselines import BASELINES, Estimate, Inputs, bone_lengths, limb_orientations
 from torchstickcal.benchmark.cases import Case
 from torchstickcal.config import config_names
 from torchstickcal.errors import CalibrationError
-from torchstickcal.pipeline import calibrate
+from torchstickcal.pipeline.calibrate import calibrate
 
 LIFTER_SIGMA_DEG = 5.0
 """Errors of the limb directions that CalibPerson is given, along each axis: those of a good network."""

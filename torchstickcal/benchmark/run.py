@@ -13,7 +13,7 @@ from pathlib import Path
 
 import torch
 
-from torchstickcal.baselines import Inputs, MissingInputError
+from torchstickcal.benchmark.baselines import Inputs, MissingInputError
 from torchstickcal.benchmark.bound import Bound, camera_bound
 from torchstickcal.benchmark.cases import Case, Source
 from torchstickcal.benchmark.memory import input_bytes, memory_needed

@@ -10,7 +10,7 @@ from torchstickcal.benchmark.cases import Source
 from torchstickcal.config import Config
 from torchstickcal.errors import CalibrationError
 from torchstickcal.metrics import pose_errors
-from torchstickcal.pipeline import calibrate
+from torchstickcal.pipeline.calibrate import calibrate
 
 
 @dataclass(frozen=True)

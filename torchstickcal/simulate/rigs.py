@@ -8,8 +8,8 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from torchstickcal.cameras import Intrinsics
 from torchstickcal.errors import CalibrationError
+from torchstickcal.geometry.cameras import Intrinsics
 from torchstickcal.simulate.skeleton import unit
 
 Array = NDArray[np.float64]

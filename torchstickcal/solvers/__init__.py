@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from torchstickcal.solvers.base import IterationRecord, Listener, Outcome, Solver, Stop, Termination, unheard
+from torchstickcal.solvers.base import IterationRecord, Listener, Outcome, Solver, StageRecord, Stop, Termination, unheard
 from torchstickcal.solvers.gauss_newton import gauss_newton
 
 __all__ = [
@@ -11,6 +11,7 @@ __all__ = [
     "Listener",
     "Outcome",
     "Solver",
+    "StageRecord",
     "Stop",
     "Termination",
     "gauss_newton",

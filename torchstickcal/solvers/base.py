@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from enum import StrEnum
 from typing import Protocol
 
-from torchstickcal.objective import Objective
-from torchstickcal.problem import State
+from torchstickcal.model.measurements import State
+from torchstickcal.model.objective import Objective
 
 
 class Stop(StrEnum):
@@ -61,6 +61,16 @@ class IterationRecord:
     """weighted root mean square reprojection residual of each camera"""
     stick_length_m: float
     """mean length of the reconstructed sticks; NaN without sticks"""
+
+
+@dataclass(frozen=True)
+class StageRecord:
+    """What happened in one stage."""
+
+    name: str
+    stop: Stop
+    seconds: float
+    iterations: tuple[IterationRecord, ...]
 
 
 Listener = Callable[[IterationRecord], None]

@@ -10,10 +10,10 @@ import math
 
 import torch
 
-from torchstickcal.objective import Objective
-from torchstickcal.problem import State
+from torchstickcal.model.measurements import State
+from torchstickcal.model.objective import Objective
 from torchstickcal.solvers.base import IterationRecord, Listener, Outcome, Stop, Termination
-from torchstickcal.solvers.normal_equations import NormalEquations, Step
+from torchstickcal.solvers.elimination.normal_equations import NormalEquations, Step
 
 _INITIAL_DAMPING = 1e-5
 _MIN_DAMPING = 1e-14

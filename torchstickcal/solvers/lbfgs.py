@@ -13,12 +13,12 @@ import torch
 from torch import Tensor
 
 from torchstickcal.extrinsics import Extrinsics
-from torchstickcal.objective import Objective
-from torchstickcal.problem import State
+from torchstickcal.geometry.symmetric import raised
+from torchstickcal.model.measurements import State
+from torchstickcal.model.objective import Objective
 from torchstickcal.solvers.base import IterationRecord, Listener, Outcome, Stop, Termination
-from torchstickcal.solvers.normal_equations import NormalEquations
-from torchstickcal.solvers.point_elimination import PointElimination
-from torchstickcal.symmetric import raised
+from torchstickcal.solvers.elimination.normal_equations import NormalEquations
+from torchstickcal.solvers.elimination.points import PointElimination
 
 _ITERATIONS_A_ROUND = 100
 _DAMPING = 1e-6

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import torch
 
-from torchstickcal.objective import Objective
-from torchstickcal.problem import State
-from torchstickcal.solvers.normal_equations import NormalEquations
+from torchstickcal.model.measurements import State
+from torchstickcal.model.objective import Objective
+from torchstickcal.solvers.elimination.normal_equations import NormalEquations
 
 _MAX_STEPS = 8
 _STEP_SIGMAS = 1e-9

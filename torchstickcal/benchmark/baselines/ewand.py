@@ -1,0 +1,72 @@
+"""eWand, a calibration with a wand (Gossard et al., ICRA 2024).
+
+A wand with markers on a line at known distances is waved through the scene. Of the published method the frame cameras' part
+is here: relative poses of pairs, then bundle adjustment of the markers' trajectories with residuals of reprojection, of the
+wand's length and of its straightness, under a robust loss.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from torchstickcal.benchmark.baselines.base import Estimate, Inputs, MissingInputError
+from torchstickcal.benchmark.baselines.frame_adjustment import FrameResiduals, adjust
+from torchstickcal.config import InitialiseSettings
+from torchstickcal.losses import Huber, ReprojectionLoss
+from torchstickcal.model.measurements import Measurements
+from torchstickcal.observations import Observations
+from torchstickcal.pipeline.initialise import initialise
+from torchstickcal.pipeline.stage import Ruler, scale_factors
+
+MIDDLE = "stick_middle"
+_SIGMA_M = 0.001
+
+
+def ewand(inputs: Inputs) -> Estimate:
+    """The stick as a wand.
+
+    A stick with two tracked ends has nothing to be straight: the residual of straightness takes part only where the session
+    has a third point on its stick, named ``stick_middle``.
+
+    Args:
+        inputs: needs a stick among the observations.
+
+    Raises:
+        MissingInputError: if there is no stick.
+        RigError: if the stick's ends alone do not relate the cameras.
+    """
+    observations = inputs.observations
+    if not observations.sticks:
+        raise MissingInputError("no stick to use as a wand", where="Inputs.observations", got="no stick", expected="a stick")
+    middle = _middle(observations)
+    ends = {end for stick in observations.sticks for end in (stick.start, stick.end)}
+    measurements = Measurements.of(observations, ends | set(middle))
+    labels = [observations.camera_label(camera) for camera in range(observations.num_cameras)]
+    state = initialise(measurements, InitialiseSettings(), labels)
+    lengths_m = measurements.lengths_m.unbind(1)
+    known = [Ruler((s.start,), (s.end,), length_m, True) for s, length_m in zip(observations.sticks, lengths_m, strict=True)]
+    state = state.scaled(scale_factors(measurements, state.points, known))
+    adjusted = adjust(measurements, state, ReprojectionLoss(kernel=Huber()), _wand(measurements, middle))
+    status = "converged" if adjusted.converged else "the bundle adjustment stopped before it had converged"
+    return Estimate.of(adjusted.state, status)
+
+
+def _middle(observations: Observations) -> list[int]:
+    """The third point of the first stick, if there is one."""
+    return [point for point, name in enumerate(observations.point_names or ()) if name == MIDDLE]
+
+
+def _wand(measurements: Measurements, middle: list[int]) -> FrameResiduals:
+    starts, ends = measurements.pairs.unbind(1)
+    complete, lengths_m = measurements.pair_active[0], measurements.lengths_m[0]
+    with_middle = complete[:, :1] & measurements.by_frame(measurements.active[0])[:, middle]
+
+    def residuals(points: Tensor) -> Tensor:
+        along = (points[:, ends] - points[:, starts]).where(complete[..., None], 1.0)
+        lengths = along.norm(dim=-1)
+        aside = torch.linalg.cross(points[:, middle] - points[:, starts[:1]], along[:, :1] / lengths[:, :1, None], dim=-1)
+        aside = (aside * with_middle[..., None]).flatten(1)
+        return torch.cat([(lengths - lengths_m) * complete, aside], dim=1) / _SIGMA_M
+
+    return residuals

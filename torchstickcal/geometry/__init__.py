@@ -1,0 +1,1 @@
+"""Cameras, rigid transforms and small symmetric matrices: geometry that knows nothing of calibration."""

@@ -1,0 +1,1 @@
+"""The calibration from keypoints to a result; ``calibrate.py`` tells the story."""

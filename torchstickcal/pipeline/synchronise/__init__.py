@@ -1,0 +1,20 @@
+"""Cameras whose clocks differ: their offsets from the motion itself, and sessions on a common frame axis."""
+
+from __future__ import annotations
+
+from torchstickcal.pipeline.synchronise.common_clock import CLOCK_STAGE, on_one_clock
+from torchstickcal.pipeline.synchronise.exposure import Exposures, Support
+from torchstickcal.pipeline.synchronise.frames import CommonFrames, on_common_frames
+from torchstickcal.pipeline.synchronise.search import ClockEstimate, out_of_step, search_offsets
+
+__all__ = [
+    "CLOCK_STAGE",
+    "ClockEstimate",
+    "CommonFrames",
+    "Exposures",
+    "Support",
+    "on_common_frames",
+    "on_one_clock",
+    "out_of_step",
+    "search_offsets",
+]
