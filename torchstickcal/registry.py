@@ -1,0 +1,104 @@
+"""Things found by name: those in a folder of the package, and those that a user's own module adds.
+
+One file in the right folder is all that a new loss, camera unknown, file format, sport or comparison method needs: the folder's
+modules are imported when a name is first looked up, and register what they define.
+"""
+
+from __future__ import annotations
+
+import difflib
+import importlib
+import pkgutil
+from collections.abc import Iterable, Iterator, Mapping
+from typing import TypeVar
+
+from torchstickcal.errors import ConfigError
+
+_Thing = TypeVar("_Thing")
+
+
+class Registry(Mapping[str, _Thing]):
+    """A mapping from names to things of one kind.
+
+    Args:
+        kind: what is registered, in the singular, for messages.
+        folder: dotted name of the package whose modules register the things that are shipped.
+
+    Example:
+        >>> units = Registry[float]("unit", "torchstickcal.configs")
+        >>> units.register("inch", 0.0254)
+        0.0254
+        >>> units["inch"], list(units)
+        (0.0254, ['inch'])
+    """
+
+    def __init__(self, kind: str, folder: str) -> None:
+        self.kind = kind
+        self._folder = folder
+        self._things: dict[str, _Thing] = {}
+        self._imported = False
+
+    def register(self, name: str, thing: _Thing, *, replace: bool = False) -> _Thing:
+        """Add a thing under a name; returns the thing.
+
+        Args:
+            name: what it is found by.
+            thing: what is found.
+            replace: whether it may take the place of another of that name, as when a notebook's cell runs again.
+
+        Raises:
+            ConfigError: if the name is taken.
+        """
+        if name in self._things and not replace:
+            raise ConfigError(
+                f"there is a {self.kind} of that name already",
+                where=f"register a {self.kind}",
+                got=repr(name),
+                expected="another name, or replace=True",
+            )
+        self._things[name] = thing
+        return thing
+
+    def __getitem__(self, name: str) -> _Thing:
+        """The thing of a name.
+
+        Raises:
+            ConfigError: if there is none, with the names that there are.
+        """
+        self._import_shipped()
+        if name not in self._things:
+            raise ConfigError(
+                f"unknown {self.kind}",
+                where=self.kind,
+                got=repr(name),
+                expected=f"one of {', '.join(self._things)}",
+                remedy=suggestion(name, self._things),
+            )
+        return self._things[name]
+
+    def __contains__(self, name: object) -> bool:
+        self._import_shipped()
+        return name in self._things
+
+    def __iter__(self) -> Iterator[str]:
+        self._import_shipped()
+        return iter(tuple(self._things))
+
+    def __len__(self) -> int:
+        self._import_shipped()
+        return len(self._things)
+
+    def _import_shipped(self) -> None:
+        """Import the folder's modules, in the order of their names."""
+        if self._imported:
+            return
+        self._imported = True
+        package = importlib.import_module(self._folder)
+        for name in sorted(module.name for module in pkgutil.iter_modules(package.__path__)):
+            importlib.import_module(f"{self._folder}.{name}")
+
+
+def suggestion(name: str, known: Iterable[str]) -> str:
+    """The known name most like a misspelt one, as a question; empty if none is."""
+    near = difflib.get_close_matches(name, list(known), n=1)
+    return f"Did you mean {near[0]!r}?" if near else ""
