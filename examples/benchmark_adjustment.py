@@ -27,8 +27,10 @@ from torch import Tensor
 from torchstickcal import Extrinsics, Intrinsics
 from torchstickcal.geometry import se3
 from torchstickcal.losses import Loss, ReprojectionLoss, SmoothnessLoss, StickLengthLoss
-from torchstickcal.model.measurements import Measurements, State
+from torchstickcal.model.measurements import Measurements
 from torchstickcal.model.objective import Objective
+from torchstickcal.model.state import State
+from torchstickcal.model.unknowns import RigUnknowns
 from torchstickcal.solvers import Termination, gauss_newton
 from torchstickcal.workers import on_worker
 
@@ -75,22 +77,25 @@ def simulated(cameras: int, frames: int, points: int) -> Problem:
     pixels = lenses.project(se3.moved(*poses, points_m[None])[0].movedim(1, -1)).movedim(-1, 1)
     pixels = (pixels + torch.from_numpy(rng.normal(0, 1, pixels.shape))).contiguous()
     knock = torch.from_numpy(rng.normal(0, 0.003, (cameras - 1, 6)))
-    start = State(*poses, points_m[None]).retracted(knock[None], torch.from_numpy(rng.normal(0, 0.01, points_m.shape))[None])
+    start = State.of(*poses, points_m[None]).retracted(knock[None], torch.from_numpy(rng.normal(0, 0.01, points_m.shape))[None])
     return Problem(pixels, lenses, frames, start.rotations[0], start.translations[0], start.points[0])
 
 
 def ours(problem: Problem, losses: dict[str, Loss]) -> Timing:
     """This project's Gauss-Newton; the cost is that of the reprojection."""
     points_per_frame = problem.pixels.shape[2] // problem.frames
+    cameras, one = problem.cameras.batched(), torch.ones(1, 1, dtype=torch.float64)
     measurements = Measurements(
-        problem.pixels[None],
-        torch.ones_like(problem.pixels[None, :, 0]),
-        problem.cameras.batched(),
-        problem.frames,
-        torch.tensor([[points_per_frame - 2, points_per_frame - 1]]),
-        torch.ones(1, 1, dtype=torch.float64),
+        pixels=problem.pixels[None],
+        confidence=torch.ones_like(problem.pixels[None, :, 0]),
+        cameras=cameras,
+        frames=problem.frames,
+        sticks=torch.tensor([[points_per_frame - 2, points_per_frame - 1]]),
+        lengths_m=one,
+        stick_sigma_m=0.001 * one[0],
+        unknowns=RigUnknowns.of((), cameras),
     )
-    start = State(problem.rotations[None], problem.translations[None], problem.points[None])
+    start = State.of(problem.rotations[None], problem.translations[None], problem.points[None])
     objective = Objective(measurements, losses)
     began = time.perf_counter()
     outcome = on_worker(

@@ -14,8 +14,9 @@ import torch
 
 from torchstickcal import CalibrationLayer, Config, load_config
 from torchstickcal.losses import ReprojectionLoss, StickLengthLoss
-from torchstickcal.model.measurements import Measurements, State
+from torchstickcal.model.measurements import Measurements
 from torchstickcal.model.objective import Objective
+from torchstickcal.model.state import State
 from torchstickcal.simulate import Noise, golf_session
 from torchstickcal.solvers.elimination.normal_equations import NormalEquations, Step
 from torchstickcal.workers import on_worker
@@ -62,7 +63,7 @@ def main() -> None:
     )
     measurements = Measurements.of(observations.to(options.device))
     points = truth.points.flatten(0, 1).mT[None] if truth.points is not None else torch.zeros(1, 3, FRAMES * POINTS)
-    state = State(*(v.to(options.device) for v in (truth.rotations[None], truth.translations[None], points.contiguous())))
+    state = State.of(*(v.to(options.device) for v in (truth.rotations[None], truth.translations[None], points.contiguous())))
     objective = Objective(measurements, {"reprojection": ReprojectionLoss(), "stick_length": StickLengthLoss(0.001)})
 
     def iteration() -> Step:

@@ -137,8 +137,8 @@ def lens_errors(found: Calibration, session: SimulatedSession, unknown: tuple[st
     if "radial" in unknown:
         assert found.distortion is not None
         assert truth.distortion is not None
-        return ((found.distortion[:, 0] - truth.distortion[:, 0]) / found.lens_std[:, 3]).numpy()
-    off = (found.intrinsics[:, 0, 0] / truth.intrinsics[:, 0, 0] - 1) / found.lens_std[:, 0]
+        return ((found.distortion[:, 0] - truth.distortion[:, 0]) / found.unknowns["radial"].std[:, 0]).numpy()
+    off = (found.intrinsics[:, 0, 0] - truth.intrinsics[:, 0, 0]) / found.unknowns["focal"].std
     return off.numpy()[: 1 if "focal_shared" in unknown else None] if unknown else np.zeros(0)
 
 
@@ -170,7 +170,7 @@ def clock_row(spec: SessionSpec, refine: tuple[str, ...]) -> Callable[[int], Out
         in_step = on_common_frames(right.observations, (right.truth.time_offsets_s * wrong.fps).round()).observations
         reference = error_m(calibrate(in_step), right)
         found, seconds = timed(session.observations, refine if refine != ("auto",) else "auto")
-        off = (found.time_offsets - session.truth.time_offsets_s) / found.time_offsets_std
+        off = (found.time_offsets - session.truth.time_offsets_s) / found.unknowns["time_offset"].std
         return Outcome(error_m(found, session), reference, off[1:].numpy(), seconds)
 
     return measure

@@ -46,7 +46,7 @@ from torch.utils.tensorboard import SummaryWriter
 
 from torchstickcal import CalibrationLayer, Config, load_config
 from torchstickcal.layer.layer import LayerResult
-from torchstickcal.losses import reprojection_residuals
+from torchstickcal.losses import ReprojectionSettings, StickLengthSettings, reprojection_residuals
 from torchstickcal.metrics import pose_errors
 
 SESSIONS_A_STEP, FRAMES_A_STEP = 2, 8
@@ -201,13 +201,15 @@ class Training:
 def calibration_config() -> Config:
     """The default, for pictures of 64 pixels and keypoints that are all a little wrong: softer, and nothing is set aside."""
     default = load_config("default")
-    reprojection = replace(default.stages["metric"].reprojection, sigma_px=1.0, kernel="cauchy", kernel_scale=1.0)
+    softer = {
+        "reprojection": ReprojectionSettings(sigma_px=1.0, kernel="cauchy", kernel_scale=1.0),
+        "stick_length": StickLengthSettings(sigma_m=0.02),
+    }
     stages = {
         name: replace(
             stage,
             reject_sigmas=None,
-            reprojection=reprojection,
-            stick_length=stage.stick_length and replace(stage.stick_length, sigma_m=0.02),
+            losses={loss: softer[loss] for loss in stage.losses},
             max_iterations=300,
             cost_tolerance=1e-6,
         )

@@ -1,7 +1,7 @@
 """Use the losses and the extrinsics in a training loop of your own, with any optimiser of torch.optim.
 
-The cameras of a calibrated rig have been knocked. Their poses and the athlete's points are learnt again from new
-keypoints by Adam; a network that predicts the keypoints or the points could stand in their place.
+The cameras of a calibrated rig were moved a little. Adam estimates their poses and the athlete's points again from new
+keypoints. A network that predicts keypoints or points could take their place.
 """
 
 import torch
@@ -26,13 +26,14 @@ points = nn.Parameter(truth.points + 0.05 * torch.randn_like(truth.points))
 reprojection = ReprojectionLoss(sigma=1.0, kernel=Cauchy(3.0))
 length, smoothness = StickLengthLoss(sigma=0.001), SmoothnessLoss(sigma=0.1)
 (stick,) = session.sticks
+start, end = stick.ends
 
 optimiser = torch.optim.Adam([*extrinsics.parameters(), points], lr=2e-3)
 schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, STEPS)
 for step in range(STEPS + 1):
     rotations, translations = extrinsics()
     loss = reprojection(points, rotations, translations, session.keypoints, session.cameras)
-    loss = loss + length(points[:, stick.start], points[:, stick.end], stick.length_m) + smoothness(points)
+    loss = loss + length(points[:, start], points[:, end], stick.length_m) + smoothness(points)
     if step % 100 == 0:
         errors = pose_errors(rotations, translations, truth.rotations, truth.translations)
         error_mm = 1000 * errors.mean_translation_m

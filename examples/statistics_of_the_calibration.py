@@ -34,8 +34,9 @@ from torchstickcal.config import InitialiseSettings
 from torchstickcal.geometry import se3
 from torchstickcal.losses import Loss, ReprojectionLoss, StickLengthLoss
 from torchstickcal.metrics import rotation_angle
-from torchstickcal.model.measurements import Measurements, State
+from torchstickcal.model.measurements import Measurements
 from torchstickcal.model.objective import Objective
+from torchstickcal.model.state import State
 from torchstickcal.pipeline.initialise import triangulated
 from torchstickcal.simulate import Noise, SessionSpec, SimulatedSession
 from torchstickcal.solvers.elimination.normal_equations import NormalEquations
@@ -188,14 +189,14 @@ def triangulated_by_least_squares(keypoints: Tensor, poses: Poses, observations:
     """Points (N, 3) of keypoints (C, N, 2) by least squares in the image, the cameras held."""
     measurements = Measurements.of(Observations(keypoints[:, :, None], observations.intrinsics, []))
     rotations, translations = poses.rotations[None], poses.translations[None]
-    start = State(rotations, translations, triangulated(measurements, rotations, translations, InitialiseSettings()))
+    start = State.of(rotations, translations, triangulated(measurements, rotations, translations, InitialiseSettings()))
     return polish(Objective(measurements, {"reprojection": ReprojectionLoss()}), start, cameras_free=False).points[0].mT
 
 
 def best_estimate(session: SimulatedSession, truth: Poses) -> tuple[Poses, Tensor]:
     """The linear estimate at the truth from the inliers, and its covariance: the least of any unbiased estimate's."""
     points = true_points(session).flatten(0, 1).mT.contiguous()
-    state = State(truth.rotations[None], truth.translations[None], points[None])
+    state = State.of(truth.rotations[None], truth.translations[None], points[None])
     measurements = Measurements.of(session.observations).keeping(torch.from_numpy(session.inliers).flatten(1)[None])
     losses: dict[str, Loss] = {"reprojection": ReprojectionLoss(SIGMA_PX), "stick_length": StickLengthLoss(EXACT_M)}
     system = NormalEquations(Objective(measurements, losses), state, cameras_free=True)

@@ -6,25 +6,33 @@ Installed as ``torchstickcal.losses``.
 if __name__ == "losses":
     raise ImportError("This folder is torchstickcal.losses: write `import torchstickcal.losses`, not `import losses`.")
 
-from torchstickcal.losses.base import CameraPointLoss, Loss, PairLoss, TrackLoss
-from torchstickcal.losses.reprojection import ReprojectionLoss, reprojection_residuals
+from torchstickcal.losses.base import CameraPointLoss, FrameLoss, Loss, TrackLoss
+from torchstickcal.losses.registry import LOSSES, LossContext, LossSettings, register_loss
+from torchstickcal.losses.reprojection import ReprojectionLoss, ReprojectionSettings, reprojection_residuals
 from torchstickcal.losses.robust import Cauchy, GemanMcClure, Huber, Quadratic, RobustKernel, robust_kernel
-from torchstickcal.losses.smoothness import SmoothnessLoss, second_differences
-from torchstickcal.losses.stick_length import StickLengthLoss, stick_lengths
+from torchstickcal.losses.smoothness import SmoothnessLoss, SmoothnessSettings, second_differences
+from torchstickcal.losses.stick_length import StickLengthLoss, StickLengthSettings, stick_lengths
 
 __all__ = [
+    "LOSSES",
     "CameraPointLoss",
     "Cauchy",
+    "FrameLoss",
     "GemanMcClure",
     "Huber",
     "Loss",
-    "PairLoss",
+    "LossContext",
+    "LossSettings",
     "Quadratic",
     "ReprojectionLoss",
+    "ReprojectionSettings",
     "RobustKernel",
     "SmoothnessLoss",
+    "SmoothnessSettings",
     "StickLengthLoss",
+    "StickLengthSettings",
     "TrackLoss",
+    "register_loss",
     "reprojection_residuals",
     "robust_kernel",
     "second_differences",

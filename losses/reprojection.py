@@ -2,35 +2,42 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+from typing import Literal, Self
+
 import torch
 from torch import Tensor
 
+from torchstickcal.geometry import projection
 from torchstickcal.geometry.cameras import Intrinsics, PixelMap, inverse_depths
 from torchstickcal.geometry.symmetric import symmetric_product
-from torchstickcal.losses.base import CameraPointLoss, CameraPointTerms, ImageStep, UnknownColumns, UnknownTerms
+from torchstickcal.losses.base import CameraPointLoss, CameraPointTerms, CameraUnknownsAt, UnknownTerms
+from torchstickcal.losses.registry import LossContext, LossSettings, register_loss
+from torchstickcal.losses.robust import robust_kernel
 
 
 def reprojection_residuals(
     points: Tensor, rotations: Tensor, translations: Tensor, keypoints: Tensor, intrinsics: Intrinsics | Tensor
 ) -> Tensor:
-    """Projection minus keypoint, in (distorted) pixels; the paper's residuals of stage 1, negated.
+    """Projection minus keypoint, in (distorted) pixels; the negative of the paper's residuals of stage 1.
 
     Args:
-        points: (..., F, P, 3), metres, world; any leading dimensions, of several sessions, are those of all the others.
+        points: (..., F, P, 3), metres, in the world; leading dimensions, of several sessions, are those of all arguments.
         rotations: (..., C, 3, 3) and translations: (..., C, 3), world to camera.
         keypoints: (..., C, F, P, 2), NaN where not seen.
         intrinsics: cameras with their lenses, or matrices (..., C, 3, 3) or (3, 3).
 
     Returns:
         (..., C, F, P, 2), zero where a keypoint was not seen or its point is not known.
+
+    Example:
+        >>> import torch
+        >>> points, keypoints = torch.tensor([[[0.0, 0.0, 2.0]]]), torch.tensor([[[[49.0, 52.0]]]])
+        >>> matrix = torch.tensor([[100.0, 0, 50], [0, 100, 50], [0, 0, 1]])
+        >>> reprojection_residuals(points, torch.eye(3)[None], torch.zeros(1, 3), keypoints, matrix)
+        tensor([[[[ 1., -2.]]]])
     """
-    cameras = _as_intrinsics(intrinsics, rotations)
-    seen = keypoints.isfinite().all(-1, keepdim=True) & points.isfinite().all(-1, keepdim=True).unsqueeze(-4)
-    in_front = torch.tensor([0.0, 0.0, 1.0]).to(points)
-    points_cam = torch.einsum("...cij,...fpj->...cfpi", rotations, points.nan_to_num())
-    points_cam = points_cam + translations[..., None, None, :]
-    projected = cameras.project(torch.where(seen, points_cam, in_front))
-    return torch.where(seen, projected - keypoints.nan_to_num(), torch.zeros_like(projected))
+    return ReprojectionLoss().of_scene(points, rotations, translations, keypoints, intrinsics)
 
 
 class ReprojectionLoss(CameraPointLoss):
@@ -40,20 +47,21 @@ class ReprojectionLoss(CameraPointLoss):
         sigma: noise of a keypoint in pixels, one number or one per point (P,).
         weight: factor on the loss.
         kernel: robust kernel; None for least squares.
+
+    Example:
+        >>> import torch
+        >>> points, keypoints = torch.tensor([[[0.0, 0.0, 2.0]]]), torch.tensor([[[[49.0, 52.0]]]])
+        >>> matrix = torch.tensor([[100.0, 0, 50], [0, 100, 50], [0, 0, 1]])
+        >>> ReprojectionLoss(sigma=2.0)(points, torch.eye(3)[None], torch.zeros(1, 3), keypoints, matrix)
+        tensor(1.2500)
     """
 
-    def forward(
-        self,
-        points: Tensor,
-        rotations: Tensor,
-        translations: Tensor,
-        keypoints: Tensor,
-        intrinsics: Intrinsics | Tensor,
-        confidence: Tensor | None = None,
-    ) -> Tensor:
-        residuals = reprojection_residuals(points, rotations, translations, keypoints, intrinsics)
-        squared = residuals.square().sum(-1) * self.information(residuals)
-        return self.total(squared if confidence is None else squared * confidence)
+    def residuals(self, points_cam: Tensor, keypoints: Tensor, intrinsics: Intrinsics) -> Tensor:
+        return projection.project(points_cam, intrinsics) - keypoints
+
+    def likelihood(self, sigma_px: Tensor) -> Self:
+        """With the noise that the keypoints were found to have, whatever the loss was given."""
+        return type(self)(sigma_px[:, None, None])
 
     def linearise(
         self,
@@ -63,7 +71,7 @@ class ReprojectionLoss(CameraPointLoss):
         information: Tensor,
         cameras: Intrinsics,
         exact: bool = False,
-        by_unknowns: UnknownColumns | None = None,
+        unknowns: CameraUnknownsAt | None = None,
     ) -> CameraPointTerms:
         # The derivative of (u, v) by the world point has the rows p / z and q / z, p = r1 - u r3 and q = r2 - v r3 with the
         # rows r of the rotation; M, the derivative of the pixel by (u, v), gives J^T W J = [p q] (M^T W M / z^2) [p q]^T.
@@ -112,8 +120,8 @@ class ReprojectionLoss(CameraPointLoss):
             gradient=gradient,
             hessian=hessian,
             unknown=None
-            if by_unknowns is None
-            else _by_unknowns(by_unknowns(u, v, m), weights, rx, ry, m, p, q, inverse_depth),
+            if unknowns is None
+            else _by_unknowns(unknowns.columns(u, v, m), weights, rx, ry, m, p, q, inverse_depth),
         )
 
     def slope(
@@ -123,19 +131,44 @@ class ReprojectionLoss(CameraPointLoss):
         pixels: Tensor,
         information: Tensor,
         cameras: Intrinsics,
-        image_step: ImageStep | None = None,
+        unknowns: CameraUnknownsAt | None = None,
+        step: Tensor | None = None,
     ) -> Tensor:
         x, y, z = points_cam.unbind(-2)
         inverse_depth = inverse_depths(z.where(information > 0, 1.0))
         u, v = x * inverse_depth, y * inverse_depth
         m = cameras.pixels_with_jacobian(u, v)
         moved_x, moved_y = m.moved(u, v, inverse_depth, moved_cam)
-        if image_step is not None:
-            own_x, own_y = image_step(u, v, m)
-            moved_x, moved_y = moved_x + own_x, moved_y + own_y
+        if unknowns is not None and step is not None:
+            by_x, by_y = unknowns.columns(u, v, m)
+            moved_x, moved_y = (moved + (step[..., None] * by).sum(-2) for moved, by in ((moved_x, by_x), (moved_y, by_y)))
         rx, ry = m.x - pixels[..., 0, :], m.y - pixels[..., 1, :]
         weights = self.weight * information * self.kernel.weight((rx.square() + ry.square()) * information)
         return (weights * (rx * moved_x + ry * moved_y)).sum()
+
+
+@register_loss("reprojection")
+@dataclass(frozen=True)
+class ReprojectionSettings(LossSettings):
+    """The reprojection loss in a configuration.
+
+    Args:
+        sigma_px: noise of a keypoint along each axis, pixels; ``estimated`` takes it from the session, for each point.
+        kernel: robust kernel.
+        kernel_scale: residual in standard deviations from which on a keypoint counts for less; None for the kernel's default.
+        weight: factor on the loss.
+    """
+
+    sigma_px: float | Literal["estimated"] = "estimated"
+    kernel: Literal["none", "cauchy", "huber", "geman_mcclure"] = "none"
+    kernel_scale: float | None = None
+    weight: float = 1.0
+
+    loss = ReprojectionLoss
+
+    def build(self, context: LossContext) -> ReprojectionLoss:
+        sigma = context.sigma_px[:, None, None] if self.sigma_px == "estimated" else self.sigma_px
+        return ReprojectionLoss(sigma, self.weight, robust_kernel(self.kernel, self.kernel_scale))
 
 
 def _by_unknowns(
@@ -167,9 +200,3 @@ def _scaled(weights: Tensor, a: Tensor, b: Tensor, c: Tensor, d: Tensor, factor:
     """``weights (a b + c d) factor`` as (..., C, 1, N)."""
     scaled = weights * torch.addcmul(a * b, c, d)
     return (scaled if factor is None else scaled * factor).unsqueeze(-2)
-
-
-def _as_intrinsics(intrinsics: Intrinsics | Tensor, rotations: Tensor) -> Intrinsics:
-    if isinstance(intrinsics, Intrinsics):
-        return intrinsics
-    return Intrinsics(intrinsics.expand_as(rotations))

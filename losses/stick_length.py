@@ -2,40 +2,68 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+from typing import Literal
+
 import torch
 from torch import Tensor
 
-from torchstickcal.geometry.symmetric import DIAGONAL, outer
-from torchstickcal.losses.base import PairLoss, PairTerms
+from torchstickcal.geometry.symmetric import DIAGONAL, expand, outer
+from torchstickcal.losses.base import FrameLoss, FrameTerms
+from torchstickcal.losses.registry import LossContext, LossSettings, register_loss
 
 _MIN_LENGTH_M = 1e-6
 
 
 def stick_lengths(starts: Tensor, ends: Tensor) -> Tensor:
-    """Distance of stick ends (..., 3), clamped below at 1e-6 m so that its gradient exists; NaN where an end is."""
-    return _length(ends - starts, dim=-1)
+    """Distances (...) of stick ends (..., 3), metres, clamped below at 1e-6 m so that a gradient exists; NaN where an end is.
+
+    Example:
+        >>> import torch
+        >>> stick_lengths(torch.zeros(3), torch.tensor([0.0, 3.0, 4.0]))
+        tensor(5.)
+    """
+    from kornia.geometry.linalg import batched_squared_norm
+
+    return batched_squared_norm(ends - starts).clamp_min(_MIN_LENGTH_M**2).sqrt()
 
 
-class StickLengthLoss(PairLoss):
+class StickLengthLoss(FrameLoss):
     """``weight * sum rho((|end - start| - length)^2 / sigma^2)`` over frames and sticks (the paper's L_length).
 
     Args:
-        sigma: how well the length holds, in metres, one number or one per stick (S,).
+        sigma: tolerance of the length, in metres, one number or one per stick (S,).
         weight: factor on the loss.
         kernel: robust kernel; None for least squares.
+
+    Example:
+        >>> import torch
+        >>> StickLengthLoss(sigma=0.5)(torch.zeros(1, 3), torch.tensor([[0.0, 3.0, 4.0]]), 4.0)
+        tensor(4.)
     """
 
     def forward(self, starts: Tensor, ends: Tensor, length_m: float | Tensor) -> Tensor:
-        """The loss of stick ends (..., F, S, 3) or (F, 3); frames in which an end is NaN do not count."""
-        known = (starts + ends).isfinite().all(-1)
-        lengths = stick_lengths(starts.nan_to_num(), ends.nan_to_num())
-        residuals = torch.where(known, lengths - length_m, torch.zeros_like(lengths))
-        return self.total(residuals.square() * self.information(residuals))
+        """The loss, a scalar, of stick ends (..., F, S, 3) or (F, 3), metres; frames in which an end is NaN do not count.
 
-    def linearise(self, difference: Tensor, length_m: Tensor, active: Tensor, exact: bool = False) -> PairTerms:
-        length = _length(difference, dim=-3)
-        information = self.information(length) * active
-        residual = length - length_m
+        Args:
+            starts: one end.
+            ends: the other.
+            length_m: the known length, one number or one per stick (S,).
+        """
+        lengths = torch.as_tensor(length_m, dtype=starts.dtype, device=starts.device)
+        grouped = torch.stack([starts, ends], dim=-2)
+        squared = self._squared(grouped, grouped.isfinite().all(-1).all(-1), lengths)
+        return self.total(squared * self.information(squared))
+
+    def groups(self, sticks: Tensor) -> Tensor:
+        return sticks
+
+    def residuals(self, points: Tensor, lengths_m: Tensor) -> Tensor:
+        return (stick_lengths(*points.unbind(-2)) - lengths_m).unsqueeze(-1)
+
+    def linearise(self, points: Tensor, sticks: Tensor, lengths_m: Tensor, active: Tensor, exact: bool = False) -> FrameTerms:
+        difference, length, information = self._between(points, sticks, active)
+        residual = length - lengths_m
         squared = residual.square() * information
         weights = self.weight * information * self.kernel.weight(squared)
         along, across = weights, torch.zeros_like(weights)
@@ -43,22 +71,46 @@ class StickLengthLoss(PairLoss):
             along = along + 2 * self.weight * information * self.kernel.curvature(squared) * squared
             across = weights * residual / length
         direction = difference / length.unsqueeze(-3)
-        hessian = outer(direction.flatten(-2)).unflatten(-1, length.shape[-2:]) * (along - across).unsqueeze(-3)
+        entries = outer(direction.flatten(-2)).unflatten(-1, length.shape[-2:]) * (along - across).unsqueeze(-3)
         for entry in DIAGONAL:
-            hessian[..., entry, :, :] += across
-        return PairTerms(
+            entries[..., entry, :, :] += across
+        block = expand(entries.flatten(-2)).unflatten(-1, length.shape[-2:])
+        gradient = direction * (weights * residual).unsqueeze(-3)
+        return FrameTerms(
             cost=self.total(squared, over=2),
-            gradient=direction * (weights * residual).unsqueeze(-3),
-            hessian=hessian,
+            gradient=torch.stack([-gradient, gradient], dim=-4),
+            hessian=torch.stack([torch.stack([block, -block], dim=-5), torch.stack([-block, block], dim=-5)], dim=-6),
         )
 
-    def slope(self, difference: Tensor, moved: Tensor, length_m: Tensor, active: Tensor) -> Tensor:
-        length = _length(difference, dim=-3)
-        information = self.information(length) * active
-        residual = length - length_m
+    def slope(self, points: Tensor, moved: Tensor, sticks: Tensor, lengths_m: Tensor, active: Tensor) -> Tensor:
+        difference, length, information = self._between(points, sticks, active)
+        residual = length - lengths_m
         weights = self.weight * information * self.kernel.weight(residual.square() * information)
-        return (weights * residual * (difference * moved).sum(-3) / length).sum()
+        starts, ends = moved[..., sticks].unbind(-1)
+        return (weights * residual * (difference * (ends - starts)).sum(-3) / length).sum()
+
+    def _between(self, points: Tensor, sticks: Tensor, active: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """From one end to the other (..., 3, F, S), the lengths (..., F, S), and 1 / sigma^2, zero for unknown ends."""
+        starts, ends = points[..., sticks].unbind(-1)
+        difference = ends - starts
+        length = difference.square().sum(-3).clamp_min(_MIN_LENGTH_M**2).sqrt()
+        return difference, length, self.information(length) * active[..., sticks].all(-1)
 
 
-def _length(difference: Tensor, dim: int) -> Tensor:
-    return difference.square().sum(dim).clamp_min(_MIN_LENGTH_M**2).sqrt()
+@register_loss("stick_length")
+@dataclass(frozen=True)
+class StickLengthSettings(LossSettings):
+    """The stick-length loss in a configuration.
+
+    Args:
+        sigma_m: tolerance of the length, metres; ``stick`` takes each stick's own, :attr:`torchstickcal.Stick.sigma_m`.
+        weight: factor on the loss.
+    """
+
+    sigma_m: float | Literal["stick"] = "stick"
+    weight: float = 1.0
+
+    loss = StickLengthLoss
+
+    def build(self, context: LossContext) -> StickLengthLoss:
+        return StickLengthLoss(context.stick_sigma_m if self.sigma_m == "stick" else self.sigma_m, self.weight)

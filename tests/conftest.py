@@ -9,7 +9,8 @@ import pytest
 import torch
 
 from torchstickcal.io import Truth
-from torchstickcal.model.measurements import Measurements, State
+from torchstickcal.model.measurements import Measurements
+from torchstickcal.model.state import State
 from torchstickcal.observations import Observations
 from torchstickcal.simulate import Noise, golf_session
 
@@ -44,7 +45,7 @@ def disturbed(noisy: tuple[Observations, Truth]) -> tuple[Measurements, State]:
     generator = torch.Generator().manual_seed(3)
     measurements = Measurements.of(observations)
     points = truth.points.flatten(0, 1).mT.contiguous()
-    start = State(truth.rotations[None], truth.translations[None], points[None])
+    start = State.of(truth.rotations[None], truth.translations[None], points[None])
     step = 0.01 * torch.randn(len(truth.rotations) - 1, 6, generator=generator, dtype=torch.float64)
     shift = 0.01 * torch.randn(points.shape, generator=generator, dtype=torch.float64)
     return measurements, start.retracted(step[None], shift[None])

@@ -17,8 +17,9 @@ from torchstickcal.geometry.se3 import exp
 from torchstickcal.io import Truth
 from torchstickcal.losses import ReprojectionLoss, StickLengthLoss
 from torchstickcal.metrics import pose_errors, rotation_angle
-from torchstickcal.model.measurements import Measurements, State
+from torchstickcal.model.measurements import Measurements
 from torchstickcal.model.objective import Objective
+from torchstickcal.model.state import State
 from torchstickcal.simulate import Cube, CubeViews, golf_session
 from torchstickcal.simulate.rigs import CameraRig
 from torchstickcal.simulate.skeleton import STANDING_HEIGHT_M
@@ -216,7 +217,7 @@ def start(truth: Truth) -> State:
     relative = truth.rotations @ truth.rotations[0].mT
     points = truth.points @ truth.rotations[0].mT + truth.translations[0]
     translations = truth.translations - relative @ truth.translations[0]
-    state = State(relative[None], translations[None], points.flatten(0, 1).mT.contiguous()[None])
+    state = State.of(relative[None], translations[None], points.flatten(0, 1).mT.contiguous()[None])
     generator = torch.Generator().manual_seed(0)
     return state.retracted(
         0.02 * torch.randn(1, 3, 6, generator=generator).double(),
@@ -227,7 +228,7 @@ def start(truth: Truth) -> State:
 def test_the_dense_adjustment_reaches_the_minimum_of_the_library_s_solver(noisy: tuple[Inputs, Truth]):
     inputs, truth = noisy
     measurements = Measurements.of(inputs.observations)
-    (first, second), length_m = measurements.pairs[0], measurements.lengths_m[0]
+    (first, second), length_m = measurements.sticks[0], measurements.lengths_m[0]
 
     def length(points: torch.Tensor) -> torch.Tensor:
         return ((points[:, second] - points[:, first]).norm(dim=1, keepdim=True) - length_m) / 0.001

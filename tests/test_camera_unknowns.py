@@ -12,9 +12,10 @@ from torch import Tensor
 from torchstickcal.geometry.cameras import Intrinsics
 from torchstickcal.losses import Cauchy, GemanMcClure, Loss, ReprojectionLoss, SmoothnessLoss, StickLengthLoss
 from torchstickcal.losses.reprojection import reprojection_residuals
-from torchstickcal.model.measurements import Measurements, State
+from torchstickcal.model.measurements import Measurements
 from torchstickcal.model.objective import Objective
-from torchstickcal.model.unknowns import REFINEMENTS, CameraUnknowns, ImageMotion
+from torchstickcal.model.state import State
+from torchstickcal.model.unknowns import REFINEMENTS, ImageMotion, RigUnknowns
 from torchstickcal.solvers.elimination.normal_equations import NormalEquations
 
 CHOICES = [(name,) for name in REFINEMENTS] + [
@@ -46,12 +47,10 @@ def unknown_rig(
         confidence=measurements.confidence[..., columns].contiguous(),
         frames=frames,
         cameras=cameras,
-        unknowns=CameraUnknowns.of(names, cameras, groups=[0, 0, 1, 1]),
+        unknowns=RigUnknowns.of(names, cameras, groups=[0, 0, 1, 1]),
     )
-    assert measurements.unknowns is not None
-    reckoned = 0.2 * measurements.unknowns.prior_sigma
-    measurements = dataclasses.replace(measurements, motion=ImageMotion(velocity, row, reckoned))
-    assert measurements.unknowns is not None
+    reference = 0.2 * measurements.unknowns.prior_sigma
+    measurements = dataclasses.replace(measurements, motion=ImageMotion(velocity, row, reference))
     values = 0.3 * measurements.unknowns.prior_sigma * torch.randn(1, measurements.unknowns.count, generator=generator)
     return measurements, dataclasses.replace(state, points=state.points[..., columns].contiguous(), unknowns=values)
 
@@ -61,8 +60,6 @@ def unknown_rig(
 def test_step_is_that_of_the_full_system(disturbed: tuple[Measurements, State], names: tuple[str, ...], lens: str):
     m, state = unknown_rig(*disturbed, names, lens)
     unknowns = m.unknowns
-    assert unknowns is not None
-    assert state.unknowns is not None
     losses: dict[str, Loss] = {"reprojection": ReprojectionLoss(2.0, kernel=Cauchy(2.0)), "length": StickLengthLoss(0.01)}
     if lens == "perfect":
         losses["smoothness"] = SmoothnessLoss(0.05, weight=0.2)
@@ -83,8 +80,8 @@ def test_step_is_that_of_the_full_system(disturbed: tuple[Measurements, State], 
         r = reprojection_residuals(points, rotations, translations, keypoints, cameras)
         whitened = r.detach().square().sum(-1) * confidence / 4
         r = r * (Cauchy(2.0).weight(whitened) * confidence).sqrt()[..., None] / 2
-        ends = points[:, m.pairs]
-        length = ((ends[:, :, 1] - ends[:, :, 0]).norm(dim=-1) - m.lengths_m[0]) * m.pair_active[0] / 0.01
+        ends = points[:, m.sticks]
+        length = ((ends[:, :, 1] - ends[:, :, 0]).norm(dim=-1) - m.lengths_m[0]) * m.stick_active[0] / 0.01
         found = [r.flatten(), length.flatten(), (values / unknowns.prior_sigma).flatten()]
         if "smoothness" in losses:
             complete = (active[2:] & active[1:-1] & active[:-2])[..., None]
@@ -105,7 +102,7 @@ def test_step_is_that_of_the_full_system(disturbed: tuple[Measurements, State], 
     torch.testing.assert_close(damped @ found, -gradient, rtol=0, atol=1e-9 * float(gradient.abs().max()))
     predicted = -2 * float(gradient @ found) - float(found @ hessian @ found)
     assert float(step.predicted_decrease) == pytest.approx(predicted, rel=1e-8)
-    terms = objective.terms(state.rotations, state.translations, at[2][None], state.unknowns)
+    terms = objective.terms(state)
     assert float(system.cost) == pytest.approx(float(sum(terms.values())), rel=1e-12)
 
 
@@ -114,8 +111,6 @@ def test_step_is_that_of_the_full_system(disturbed: tuple[Measurements, State], 
 def test_exact_hessian_and_slope_are_autograds(disturbed: tuple[Measurements, State], names: tuple[str, ...], lens: str):
     """At a state that is no minimum: all terms of the second derivative take part."""
     m, state = unknown_rig(*disturbed, names, lens, frames=2)
-    assert m.unknowns is not None
-    assert state.unknowns is not None
     losses: dict[str, Loss] = {"reprojection": ReprojectionLoss(9.0, 0.7, GemanMcClure(8.0)), "length": StickLengthLoss(0.1)}
     objective, count = Objective(m, losses), m.unknowns.count
     sizes = [18, count, state.points.numel()]
@@ -130,8 +125,7 @@ def test_exact_hessian_and_slope_are_autograds(disturbed: tuple[Measurements, St
         turned = torch.cat([state.rotations[:, :1], state.rotations[:, 1:] @ step[None, :, :3, :3]], dim=1)
         moved = (state.rotations[:, 1:] @ step[None, :, :3, 3:])[..., 0] + state.translations[:, 1:]
         translations = torch.cat([state.translations[:, :1], moved], dim=1)
-        points = m.by_frame(state.points + points).movedim(1, -1)
-        terms = objective.terms(turned, translations, points, at + unknowns)
+        terms = objective.terms(State(turned, translations, state.points + points, at + unknowns))
         return torch.stack(list(terms.values())).sum() / 2
 
     zero = torch.zeros(sum(sizes), dtype=torch.float64)

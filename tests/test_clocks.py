@@ -10,8 +10,9 @@ import torch
 
 from torchstickcal import Calibration, ConfigError, ObservationError, Observations, calibrate
 from torchstickcal.metrics import pose_errors
-from torchstickcal.model.measurements import Measurements, State
+from torchstickcal.model.measurements import Measurements
 from torchstickcal.model.noise import residual_correlation
+from torchstickcal.model.state import State
 from torchstickcal.simulate import Clocks, SessionSpec, SimulatedSession
 from torchstickcal.simulate.regimes import GaussianNoise
 from torchstickcal.simulate.session import Assumptions
@@ -49,8 +50,8 @@ def test_offsets_are_found_to_their_stated_deviation():
         session = replace(SPEC, seed=seed, clocks=HALF_FRAMES).generate()
         found = calibrate(session.observations, refine=["time_offset"])
         assert found.refined == ("time_offset",)
-        assert 0 < float(found.time_offsets_std[1:].max()) * FPS < 0.02
-        squared += (offset_errors_frames(found, session)[1:] / FPS / found.time_offsets_std[1:]).square().tolist()
+        assert 0 < float(found.unknowns["time_offset"].std[1:].max()) * FPS < 0.02
+        squared += (offset_errors_frames(found, session)[1:] / FPS / found.unknowns["time_offset"].std[1:]).square().tolist()
         in_step = replace(SPEC, seed=seed).generate()
         errors += np.array([error_mm(found, session), error_mm(calibrate(in_step.observations), in_step)])
     assert errors[0] < 1.4 * errors[1]
@@ -67,8 +68,9 @@ def test_cameras_that_did_not_start_together():
     found = calibrate(session.observations, refine=["time_offset", "readout", "focal_shared"])
     assert found.converged
     assert offset_errors_frames(found, session).abs().max() < 0.05
-    assert float(found.readout[0]) == pytest.approx(0.015, abs=5 * float(found.readout_std[0]))
-    assert float(found.focal_ratio[0]) == pytest.approx(1 / 1.03, rel=0.01)
+    readout, focal = found.unknowns["readout"], found.unknowns["focal"]
+    assert float(readout.value[0]) == pytest.approx(0.015, abs=5 * float(readout.std[0]))
+    assert float(focal.value[0] / focal.given[0]) == pytest.approx(1 / 1.03, rel=0.01)
     assert error_mm(found, session) < 15
     assert found.times is not None
     truth = torch.from_numpy(wrong.motion.points(found.times.numpy()))
@@ -102,15 +104,15 @@ def test_clocks_that_are_apart_are_told_where_they_are_not_found():
     truth = session.truth.time_offsets_s
     assert truth is not None
     assert (found.time_offsets == 0).all()
-    assert (found.late - truth).abs().max() * FPS < 0.05
-    assert sum("later than told" in warning for warning in found.warnings) == int((truth.abs() * FPS > 0.1).sum())
-    assert not [warning for warning in calibrate(SPEC.generate().observations).warnings if "later than told" in warning]
+    assert (found.unknowns["time_offset"].suggested - truth).abs().max() * FPS < 0.05
+    assert sum("time offset" in warning for warning in found.warnings) == int((truth.abs() * FPS > 0.1).sum())
+    assert not [warning for warning in calibrate(SPEC.generate().observations).warnings if "time offset" in warning]
 
 
 def test_cameras_frames_apart_are_told_where_they_are_not_searched_for():
     apart = replace(SPEC, clocks=Clocks(1.0)).generate().observations
-    assert any("do not seem to be in step" in warning for warning in calibrate(apart).warnings)
-    assert not any("in step" in warning for warning in calibrate(SPEC.generate().observations).warnings)
+    assert any("do not seem to be synchronised" in warning for warning in calibrate(apart).warnings)
+    assert not any("synchronised" in warning for warning in calibrate(SPEC.generate().observations).warnings)
 
 
 def test_a_known_read_out_time_is_taken_into_account():
@@ -118,7 +120,7 @@ def test_a_known_read_out_time_is_taken_into_account():
     known = replace(session.observations, readout_s=0.015)
     found = calibrate(known)
     assert found.refined == ()
-    assert (found.readout == 0.015).all()
+    assert (found.unknowns["readout"].value == 0.015).all()
     assert error_mm(found, session) < 0.1 < error_mm(calibrate(session.observations), session)
     assert float(found.times[0]) == pytest.approx(0.0075)  # pyright: ignore[reportOptionalSubscript]
 
@@ -143,14 +145,14 @@ def test_a_body_at_rest_tells_no_clock():
     noise = torch.randn(keypoints.shape, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
     found = calibrate(replace(still, keypoints=keypoints + noise), refine=["time_offset"])
     assert found.time_offsets.abs().max() * FPS < 0.5
-    assert any("time_offset stays near what was given" in warning for warning in found.warnings)
+    assert any("time_offset stays near the given value" in warning for warning in found.warnings)
 
 
 def test_what_is_missing_for_clocks_is_said():
     given = SPEC.generate().observations
-    with pytest.raises(ObservationError, match="clocks without what they are counted in"):
+    with pytest.raises(ObservationError, match="clocks cannot be estimated without a frame rate"):
         calibrate(replace(given, fps=None), refine=["time_offset"])
-    with pytest.raises(ObservationError, match="clocks without what they are counted in"):
+    with pytest.raises(ObservationError, match="clocks cannot be estimated without a frame rate"):
         calibrate(replace(given, image_size=None), refine=["readout"])
     with pytest.raises(ObservationError, match="a read-out time without what it is counted in"):
         replace(given, fps=None, readout_s=0.01)
@@ -158,7 +160,8 @@ def test_what_is_missing_for_clocks_is_said():
         replace(given, readout_s=-0.01)
     without_rate = calibrate(replace(given, fps=None))
     assert without_rate.times is None
-    assert bool(without_rate.late[1:].isnan().all())
+    assert bool(without_rate.unknowns["time_offset"].suggested[1:].isnan().all())
+    assert (without_rate.time_offsets == 0).all()
     with pytest.raises(ConfigError, match="unusable value"):
         calibrate(given, {"extends": "default", "max_offset_s": -1.0})
 
@@ -174,7 +177,7 @@ def test_both_solvers_agree_on_the_clocks():
     session = replace(SPEC, frames=40, clocks=HALF_FRAMES).generate()
     by_newton = calibrate(session.observations, refine=["time_offset"])
     by_lbfgs = calibrate(session.observations, "lbfgs", refine=["time_offset"])
-    off = (by_newton.time_offsets - by_lbfgs.time_offsets)[1:] / by_newton.time_offsets_std[1:]
+    off = (by_newton.time_offsets - by_lbfgs.time_offsets)[1:] / by_newton.unknowns["time_offset"].std[1:]
     assert off.abs().max() < 0.1
 
 
@@ -182,11 +185,13 @@ def test_single_precision_comes_back_and_saves(tmp_path):
     session = replace(SPEC, frames=60, clocks=HALF_FRAMES).generate()
     given = session.observations
     found = calibrate(replace(given, keypoints=given.keypoints.float()), refine=["time_offset", "readout"])
-    assert found.time_offsets.dtype == found.readout_std.dtype == torch.float32
+    assert found.time_offsets.dtype == found.unknowns["readout"].std.dtype == torch.float32
     found.save(tmp_path / "c.npz")
     again = Calibration.load(tmp_path / "c.npz")
-    for name in ("time_offsets", "time_offsets_std", "readout", "readout_std", "late", "late_std", "frame_index", "times"):
+    for name in ("time_offsets", "frame_index", "times"):
         assert torch.equal(getattr(again, name), getattr(found, name))
+    for name in ("time_offset", "readout"):
+        assert torch.equal(again.unknowns[name].std, found.unknowns[name].std)
 
 
 @pytest.mark.parametrize("correlation", [0.0, 0.6])
@@ -201,6 +206,6 @@ def test_residuals_that_are_alike_are_noticed(correlation: float):
     measurements = Measurements.of(replace(given, keypoints=rest + noise))
     assert truth.points is not None
     points = truth.points[:1].expand(400, -1, -1).flatten(0, 1).mT[None].contiguous()
-    state = State(truth.rotations[None], truth.translations[None], points)
+    state = State.of(truth.rotations[None], truth.translations[None], points)
     sigma_px = torch.ones(1, given.num_points, dtype=torch.float64)
     assert residual_correlation(measurements, state, sigma_px) == pytest.approx(correlation, abs=0.02)

@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 
 from torchstickcal import ConfigError, config_names, load_config
+from torchstickcal.losses import SmoothnessSettings, StickLengthSettings
 
 SHIPPED = ["default", "human_only", "lbfgs", "paper", "stick_only", "without_length", "without_smoothness"]
 
@@ -19,9 +20,8 @@ def test_shipped_configurations_are_found_by_name():
 
 def test_paper_has_the_papers_weights():
     stage = load_config("paper").stages["metric"]
-    assert stage.stick_length is not None
-    assert stage.smoothness is not None
-    assert (stage.stick_length.weight, stage.smoothness.weight) == (0.4, 0.2)
+    assert stage.losses["stick_length"] == StickLengthSettings(sigma_m=1.0, weight=0.4)
+    assert stage.losses["smoothness"] == SmoothnessSettings(sigma_m=1.0, weight=0.2)
     assert stage.rescale
 
 
@@ -31,9 +31,9 @@ def test_extending_changes_only_what_is_said(tmp_path: Path):
         'extends = "default"\n[stages.metric]\nstick_length = { sigma_m = 0.002 }\n[stages.trajectories]\nsmoothness = false\n'
     )
     mine, default = load_config(file), load_config("default")
-    assert mine.stages["metric"].stick_length.sigma_m == 0.002
-    assert mine.stages["metric"].reprojection == default.stages["metric"].reprojection
-    assert mine.stages["trajectories"].smoothness is None
+    assert mine.stages["metric"].losses["stick_length"] == StickLengthSettings(sigma_m=0.002)
+    assert mine.stages["metric"].losses["reprojection"] == default.stages["metric"].losses["reprojection"]
+    assert "smoothness" not in mine.stages["trajectories"].losses
     assert list(mine.stages) == list(default.stages)
     assert mine.stages["unscaled"] == default.stages["unscaled"]
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
+
 import pytest
 import torch
 from torch import Tensor
@@ -10,36 +12,47 @@ from torchstickcal.geometry import se3
 from torchstickcal.geometry.cameras import Intrinsics
 from torchstickcal.geometry.symmetric import expand, inverse_diagonal
 from torchstickcal.model.measurements import Measurements
+from torchstickcal.model.unknowns import RigUnknowns
 from torchstickcal.solvers.elimination.cross_blocks import cross_rows, symmetric_times
-from torchstickcal.solvers.elimination.parts import Couplings, Part, parts
+from torchstickcal.solvers.elimination.parts import BetweenFrames, Couplings, Part, WithinFrame, parts
 from torchstickcal.solvers.elimination.tracks import BlockTridiagonal
 
-P = 5
-PAIRS = torch.tensor([[3, 4], [1, 0]])
+P = 6
+CLUSTERS = {
+    "single points": [],
+    "pairs": [(0, 1), (3, 4)],
+    "a pair and three": [(0, 2, 5), (3, 4)],
+    "all": [(0, 1, 2, 3, 4, 5)],
+}
 
 
 def entries(blocks: Tensor) -> Tensor:
     return torch.stack([blocks[i, j] for i, j in ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))])
 
 
-def system(frames: int, smooth: bool) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
-    """Dense matrix (ordered frame, point, axis), diagonal blocks, stick coupling, and couplings between frames."""
+def system(frames: int, clusters: list[tuple[int, ...]], smooth: bool) -> tuple[Tensor, Tensor, Couplings]:
+    """Dense matrix (ordered frame, point, axis), the points' own blocks, and the blocks between different points."""
     generator = torch.Generator().manual_seed(frames)
 
     def random(*shape: int) -> Tensor:
         return torch.randn(*shape, generator=generator, dtype=torch.float64)
 
-    a, b = random(3, 3, frames, P), random(3, 3, frames, 2)
-    blocks = torch.einsum("ikfp,jkfp->ijfp", a, a) + torch.eye(3, dtype=torch.float64)[..., None, None]
-    coupling = torch.einsum("ikfs,jkfs->ijfs", b, b)
-    blocks[..., PAIRS] += coupling[..., None]
     dense = torch.zeros(frames, P, 3, frames, P, 3, dtype=torch.float64)
-    for s, (start, end) in enumerate(PAIRS.tolist()):
-        for f in range(frames):
-            dense[f, start, :, f, end, :] = dense[f, end, :, f, start, :] = -coupling[:, :, f, s]
-    next_frame = torch.zeros(frames - 1, P, dtype=torch.float64)
-    second_frame = torch.zeros(max(frames - 2, 0), P, dtype=torch.float64)
+    for f in range(frames):
+        for cluster in [*((point,) for point in range(P)), *clusters]:
+            root = random(3 * len(cluster), 3 * len(cluster))
+            block = (root @ root.mT + torch.eye(len(root))).view(len(cluster), 3, len(cluster), 3)
+            for i, first in enumerate(cluster):
+                for j, second in enumerate(cluster):
+                    dense[f, first, :, f, second, :] += block[i, :, j]
+    within = WithinFrame()
+    for cluster in clusters:
+        for first, second in itertools.combinations(cluster, 2):
+            own = torch.stack([dense[f, second, :, f, first, :] for f in range(frames)], dim=-1)
+            within.add(torch.tensor([second]), torch.tensor([first]), own[None, ..., None])
+    between = None
     if smooth:
+        next_frame, second_frame = (torch.zeros(frames - step, P, dtype=torch.float64) for step in (1, 2))
         stencil = torch.zeros(frames - 2, frames, dtype=torch.float64)
         for f in range(frames - 2):
             stencil[f, f : f + 3] = torch.tensor([1.0, -2, 1])
@@ -47,20 +60,18 @@ def system(frames: int, smooth: bool) -> tuple[Tensor, Tensor, Tensor, Tensor, T
             track = stencil.mT @ torch.diag(random(frames - 2).square()) @ stencil
             next_frame[:, p], second_frame[:, p] = track.diagonal(1), track.diagonal(2)
             for axis in range(3):
-                dense[:, p, axis, :, p, axis] += track - torch.diag(track.diagonal())
-                blocks[axis, axis, :, p] += track.diagonal()
-    for f in range(frames):
-        for p in range(P):
-            dense[f, p, :, f, p, :] = blocks[:, :, f, p]
-    return dense.reshape(frames * P * 3, -1), entries(blocks), entries(coupling), next_frame, second_frame
+                dense[:, p, axis, :, p, axis] += track
+        between = BetweenFrames(next_frame[None], second_frame[None])
+    own = torch.stack([dense[f, p, :, f, p, :] for f in range(frames) for p in range(P)], dim=-1)
+    return dense.reshape(frames * P * 3, -1), entries(own), Couplings(within, between)
 
 
 def flat(columns: Tensor) -> Tensor:
     return columns.mT.flatten()
 
 
-def check(part: Part, hessian: Tensor, dense: Tensor) -> None:
-    """A part that holds all columns, against dense algebra, for random blocks N_c of two cameras and a random gradient."""
+def check(found: list[Part], hessian: Tensor, dense: Tensor) -> None:
+    """Parts that together hold all columns against dense algebra, for random blocks N_c of two cameras and a gradient."""
     count = hessian.shape[1]
     generator = torch.Generator().manual_seed(count)
     shapes = ((1, 2, 6, count), (1, 3, count), (1, 3, count))
@@ -68,21 +79,25 @@ def check(part: Part, hessian: Tensor, dense: Tensor) -> None:
     coupling = torch.stack([flat(row) for row in cross_rows(cross, points)[0].flatten(0, 1)])
     right = torch.cat([coupling, flat(gradient[0])[None]])
     expected = right @ torch.linalg.solve(dense, right.mT)
-    columns = part.columns
-    elimination = part.eliminate(hessian[None, :, columns])
-    rows, half = elimination.reductions(cross[..., columns], points[..., columns], gradient[..., columns])
-    both = torch.cat([rows, half[:, None]], dim=1)[0]
-    torch.testing.assert_close(both @ both.mT, expected, rtol=1e-11, atol=1e-11 * float(expected.abs().max()))
-    solution = torch.empty_like(gradient)
-    solution[..., columns] = elimination.solve(gradient[..., columns])
-    torch.testing.assert_close(flat(solution[0]), torch.linalg.solve(dense, flat(gradient[0])), rtol=1e-11, atol=1e-12)
+    reduced, solution = torch.zeros_like(expected), torch.empty_like(gradient)
+    for part in found:
+        columns = part.columns
+        elimination = part.eliminate(hessian[None, :, columns])
+        rows, half = elimination.reductions(cross[..., columns], points[..., columns], gradient[..., columns])
+        both = torch.cat([rows, half[:, None]], dim=1)[0]
+        reduced += both @ both.mT
+        solution[..., columns] = elimination.solve(gradient[..., columns])
+    torch.testing.assert_close(reduced, expected, rtol=1e-10, atol=1e-10 * float(expected.abs().max()))
+    torch.testing.assert_close(flat(solution[0]), torch.linalg.solve(dense, flat(gradient[0])), rtol=1e-10, atol=1e-11)
 
 
-def session(frames: int, pairs: Tensor) -> Measurements:
+def session(frames: int) -> Measurements:
     """Nothing but the shape of a session of one camera."""
     cameras = Intrinsics(torch.eye(3, dtype=torch.float64)[None, None])
-    pixels, confidence = torch.zeros(1, 1, 2, frames * P), torch.ones(1, 1, frames * P)
-    return Measurements(pixels, confidence, cameras, frames, pairs, torch.ones(1, len(pairs)))
+    pixels, confidence = torch.zeros(1, 1, 2, frames * P, dtype=torch.float64), torch.ones(1, 1, frames * P)
+    nothing = torch.zeros(0)
+    unknowns = RigUnknowns.of((), cameras)
+    return Measurements(pixels, confidence, cameras, frames, torch.zeros(0, 2).long(), nothing[None], nothing, unknowns)
 
 
 def test_cross_rows_are_blocks_times_the_cameras_jacobian():
@@ -96,43 +111,31 @@ def test_cross_rows_are_blocks_times_the_cameras_jacobian():
     torch.testing.assert_close(symmetric_times(blocks[None], vectors[None])[0], expected)
 
 
-@pytest.mark.parametrize("frames", [2, 3, 7])
-def test_points_and_sticks(frames: int):
-    dense, blocks, coupling, *_ = system(frames, smooth=False)
-    (part,) = parts(session(frames, PAIRS), Couplings(coupling[None], None, None))
-    check(part, blocks.flatten(1), dense)
+@pytest.mark.parametrize("clusters", CLUSTERS.values(), ids=CLUSTERS.keys())
+@pytest.mark.parametrize("frames", [1, 2, 3, 7])
+@pytest.mark.parametrize("chunk", [6, 32_000])
+def test_points_of_one_frame(frames: int, clusters: list[tuple[int, ...]], chunk: int, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr("torchstickcal.model.measurements._CHUNK_KEYPOINTS", {"cpu": chunk})
+    dense, blocks, couplings = system(frames, clusters, smooth=False)
+    check(parts(session(frames), clusters, couplings), blocks, dense)
 
 
-def test_points_alone():
-    _, blocks, *_ = system(4, smooth=False)
-    matrices = expand(blocks.flatten(1)).movedim(-1, 0)
-    (part,) = parts(session(4, PAIRS), Couplings(None, None, None))
-    check(part, blocks.flatten(1), torch.block_diag(*matrices))
-    found = inverse_diagonal(blocks.flatten(1))
-    torch.testing.assert_close(found.mT, torch.linalg.inv(matrices).diagonal(dim1=1, dim2=2))
-
-
+@pytest.mark.parametrize("clusters", CLUSTERS.values(), ids=CLUSTERS.keys())
 @pytest.mark.parametrize("frames", [3, 4, 5, 8, 11])
 @pytest.mark.parametrize("together", [1, 1000])
-def test_tracks(frames: int, together: int, monkeypatch: pytest.MonkeyPatch):
+def test_tracks(frames: int, clusters: list[tuple[int, ...]], together: int, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr("torchstickcal.solvers.elimination.parts._TRACK_POINTS", together)
-    dense, blocks, coupling, next_frame, second_frame = system(frames, smooth=True)
-    by_point = dense.reshape(frames, P, 3, frames, P, 3)
-    found = parts(session(frames, PAIRS), Couplings(coupling[None], next_frame[None], second_frame[None]))
-    assert sorted(torch.cat([part.columns for part in found]).tolist()) == list(range(frames * P))
-    for part in found:
-        members = torch.unique(part.columns % P)
-        inside = by_point[:, members][:, :, :, :, members].reshape(frames * len(members) * 3, -1)
-        order = torch.empty(frames * P, dtype=torch.long)
-        order[(torch.arange(frames)[:, None] * P + members).flatten()] = torch.arange(frames * len(members))
-        check(_Renumbered(part, order[part.columns]), blocks[..., members].flatten(1), inside)
+    dense, blocks, couplings = system(frames, clusters, smooth=True)
+    found = parts(session(frames), clusters, couplings)
+    columns = torch.cat([torch.arange(frames * P)[part.columns] for part in found])
+    assert sorted(columns.tolist()) == list(range(frames * P))
+    check(found, blocks, dense)
 
 
-class _Renumbered:
-    """A part of some points as a part that holds all columns of a session of these points."""
-
-    def __init__(self, part: Part, columns: Tensor) -> None:
-        self.columns, self.chunks, self.eliminate = columns, [columns], part.eliminate
+def test_mean_variance_of_a_point():
+    _, blocks, _ = system(4, [], smooth=False)
+    matrices = expand(blocks).movedim(-1, 0)
+    torch.testing.assert_close(inverse_diagonal(blocks).mT, torch.linalg.inv(matrices).diagonal(dim1=1, dim2=2))
 
 
 @pytest.mark.parametrize("count", [1, 2, 3, 6, 9])

@@ -131,6 +131,11 @@ def test_calibration_round_trip(tmp_path: Path, noisy):
         value, other = getattr(calibration, field.name), getattr(back, field.name)
         if isinstance(value, torch.Tensor):
             torch.testing.assert_close(other, value, rtol=0, atol=0, equal_nan=True)
+        elif field.name == "unknowns":
+            assert other.keys() == value.keys()
+            for name in value:
+                torch.testing.assert_close(other[name].suggested, value[name].suggested, rtol=0, atol=0)
+                assert (other[name].unit, other[name].components) == (value[name].unit, value[name].components)
         else:
             assert other == value, field.name
     assert back.status == calibration.status

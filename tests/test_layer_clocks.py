@@ -74,7 +74,7 @@ def test_cameras_and_clocks_are_those_of_calibrate():
     session = replace(SPEC, frames=120).generate()
     found = run(CalibrationLayer(session.observations.sticks, config("time_offset")), session)
     expected = calibrate(session.observations, config("time_offset"))
-    off = (found.time_offsets / FPS - expected.time_offsets)[1:] / expected.time_offsets_std[1:]
+    off = (found.time_offsets / FPS - expected.time_offsets)[1:] / expected.unknowns["time_offset"].std[1:]
     assert off.abs().max() < 0.05
     assert ((found.translations - expected.translations)[1:].norm(dim=-1) / expected.camera_std_m[1:]).max() < 0.05
 
@@ -102,7 +102,9 @@ def test_a_warm_start_leads_to_the_same_place_from_the_clocks_found():
     layer = CalibrationLayer(session.observations.sticks, config("time_offset"))
     before, cold = run(layer, session, session.observations.keypoints + 0.5), run(layer, session)
     failed = replace(before, converged=torch.zeros_like(before.converged))
-    tenth_of_deviation = float(calibrate(session.observations, config("time_offset")).time_offsets_std.max()) * FPS / 10
+    tenth_of_deviation = (
+        float(calibrate(session.observations, config("time_offset")).unknowns["time_offset"].std.max()) * FPS / 10
+    )
     for initial in (before, failed):
         warm = run(layer, session, initial=initial)
         torch.testing.assert_close(warm.time_offsets, cold.time_offsets, rtol=0, atol=tenth_of_deviation)
@@ -112,19 +114,19 @@ def test_a_warm_start_leads_to_the_same_place_from_the_clocks_found():
 @pytest.mark.parametrize("refine", [("time_offset",), ("time_offset", "readout", "focal_shared")])
 def test_gradients_are_those_of_the_solve_with_the_motion_as_it_is(monkeypatch: pytest.MonkeyPatch, refine: tuple[str, ...]):
     session = ROLLING.generate()
-    layer, placed = layer_of(session, *refine), Exposures.placed
+    layer, moved = layer_of(session, *refine), Exposures.on_common_frames
     last: list[Callable[[Measurements], Measurements]] = []
 
     def recorded(self: Exposures, seen: Measurements, *at: Any) -> Measurements:
-        found = placed(self, seen, *at)
+        found = moved(self, seen, *at)
         shift, weight = found.pixels - seen.pixels, (found.confidence / seen.confidence).nan_to_num()
         last.append(lambda m: replace(m, pixels=m.pixels + shift, confidence=m.confidence * weight, motion=found.motion))
         return found
 
-    monkeypatch.setattr(Exposures, "placed", recorded)
+    monkeypatch.setattr(Exposures, "on_common_frames", recorded)
     keypoints = session.observations.keypoints.clone().requires_grad_()
     result = run(layer, session, keypoints)
-    monkeypatch.setattr(Exposures, "placed", lambda _, seen, *at: last[-1](seen))
+    monkeypatch.setattr(Exposures, "on_common_frames", lambda _, seen, *at: last[-1](seen))
     generator = torch.Generator().manual_seed(0)
     direction = torch.randn(keypoints.shape, generator=generator, dtype=torch.float64)
     step = 1e-3
@@ -177,7 +179,7 @@ def test_a_step_down_a_loss_on_the_offsets_lowers_it():
 def test_a_read_out_time_needs_the_image_size():
     given = SPEC.generate().observations
     layer = CalibrationLayer(given.sticks, config("readout"))
-    with pytest.raises(ObservationError, match="a read-out time without what it is counted in"):
+    with pytest.raises(ObservationError, match="a read-out time cannot be estimated without the image size"):
         layer(given.keypoints, given.cameras)
     with pytest.raises(ObservationError, match="image_size"):
         layer(given.keypoints, given.cameras, image_size=(1920, 1080, 3))

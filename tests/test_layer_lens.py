@@ -178,7 +178,7 @@ def test_lenses_not_refined_are_passed_on():
 
 
 def test_what_has_no_gradient_and_groups_that_do_not_fit_are_refused():
-    with pytest.raises(ConfigError, match="does not choose what to refine"):
+    with pytest.raises(ConfigError, match="cannot choose what to refine"):
         CalibrationLayer(STICK, {"extends": "default", "refine": "auto"})
     with pytest.raises(ConfigError, match="camera groups do not fit"):
         CalibrationLayer(STICK, config("focal_shared") | {"camera_groups": ["a"]})(OBSERVATIONS.keypoints, inputs().matrix)

@@ -13,7 +13,7 @@ from torchstickcal.benchmark.bound import camera_bound
 from torchstickcal.benchmark.cases import Case
 from torchstickcal.errors import ConfigError, ObservationError
 from torchstickcal.metrics import pose_errors
-from torchstickcal.pipeline.check import with_refinements
+from torchstickcal.model.unknowns import with_refinements
 from torchstickcal.simulate import Lens, SessionSpec, SimulatedSession
 from torchstickcal.simulate.regimes import GaussianNoise
 from torchstickcal.simulate.session import Assumptions
@@ -82,8 +82,12 @@ def test_nothing_refined_costs_nothing():
 def test_wrong_focal_length_is_told_where_it_is_not_refined():
     found = calibrate(session(focal_scale=1.03).observations)
     assert found.refined == ()
-    assert all(abs(ratio - 1 / 1.03) < 5e-3 for ratio in found.focal_ratio.tolist())
-    assert sum("of the given focal length is what the data want" in warning for warning in found.warnings) == 4
+    focal = found.unknowns["focal"]
+    assert not focal.refined
+    assert focal.std.isnan().all()
+    assert torch.equal(focal.value, focal.given)
+    assert ((focal.suggested / focal.given - 1 / 1.03).abs() < 5e-3).all()
+    assert sum("focal length" in warning and "was given and used" in warning for warning in found.warnings) == 4
 
 
 def test_stated_deviation_is_the_scatter():
@@ -92,8 +96,8 @@ def test_stated_deviation_is_the_scatter():
         seen = session(seed, focal_scale=0.97)
         found = calibrate(seen.observations, refine=["focal"])
         assert seen.truth.intrinsics is not None
-        off = found.intrinsics[:, 0, 0] / seen.truth.intrinsics[:, 0, 0] - 1
-        squared += (off / found.lens_std[:, 0]).square().tolist()
+        off = found.intrinsics[:, 0, 0] - seen.truth.intrinsics[:, 0, 0]
+        squared += (off / found.unknowns["focal"].std).square().tolist()
     assert 0.5 < np.mean(squared) < 1.6
 
 
@@ -121,7 +125,7 @@ def test_what_the_data_do_not_tell_stays_and_is_named():
     seen = session(cameras=2, sigma_px=2.0)
     few = dataclasses.replace(seen.observations, keypoints=seen.observations.keypoints[:, :12])
     found = calibrate(few, refine=["radial"])
-    assert any("k2 stays near what was given" in warning for warning in found.warnings)
+    assert any("k2 stays near the given value" in warning for warning in found.warnings)
 
 
 def test_unknown_refinement_is_refused():
@@ -142,4 +146,8 @@ def test_saved_and_loaded(tmp_path):
     found.save(tmp_path / "c.npz")
     again = Calibration.load(tmp_path / "c.npz")
     assert again.refined == found.refined
-    torch.testing.assert_close(again.lens_std, found.lens_std, rtol=0, atol=0)
+    for name, parameter in found.unknowns.items():
+        other = again.unknowns[name]
+        assert (other.label, other.unit, other.refined) == (parameter.label, parameter.unit, parameter.refined)
+        for field in ("value", "std", "given", "suggested"):
+            torch.testing.assert_close(getattr(other, field), getattr(parameter, field), rtol=0, atol=0, equal_nan=True)

@@ -148,12 +148,13 @@ def test_stick_length(kernel):
     lengths = torch.tensor([1.0, 1.2], dtype=torch.float64)
     assert torch.autograd.gradcheck(lambda a, b: loss(a, b, lengths), (starts, ends))
 
-    difference = (ends - starts).detach().movedim(-1, 0)
-    terms = loss.linearise(difference, lengths, torch.ones(F, 2, dtype=torch.bool))
+    points = torch.cat([starts, ends], dim=1).detach().movedim(-1, 0)
+    sticks = torch.tensor([[0, 2], [1, 3]])
+    terms = loss.linearise(points, sticks, lengths[None], torch.ones(F, 4, dtype=torch.bool))
     value = loss(starts, ends, lengths)
     torch.testing.assert_close(terms.cost, value.detach())
-    (gradient,) = torch.autograd.grad(value, ends)
-    torch.testing.assert_close(2 * terms.gradient.movedim(0, -1), gradient)
+    by_starts, by_ends = torch.autograd.grad(value, (starts, ends))
+    torch.testing.assert_close(2 * terms.gradient.movedim(1, -1), torch.stack([by_starts, by_ends]))
 
 
 def test_stick_length_closed_form_and_degenerate_stick():

@@ -6,8 +6,9 @@ import pytest
 import torch
 
 from torchstickcal import calibrate
-from torchstickcal.model.measurements import Measurements, State
+from torchstickcal.model.measurements import Measurements
 from torchstickcal.model.noise import estimate_acceleration_m, estimate_sigma_px
+from torchstickcal.model.state import State
 from torchstickcal.simulate import Noise, golf_session
 
 
@@ -30,7 +31,7 @@ def test_points_of_different_noise_are_told_apart_and_alike_ones_are_treated_ali
         measurements = Measurements.of(observations)
         measurements = Measurements(pixels, measurements.confidence, *list(vars(measurements).values())[2:])
         points = truth.points.flatten(0, 1).mT.contiguous()
-        state = State(truth.rotations[None], truth.translations[None], points[None])
+        state = State.of(truth.rotations[None], truth.translations[None], points[None])
         return estimate_sigma_px(measurements, measurements.squared_residuals(state))[0]
 
     alike = estimated(sigma)

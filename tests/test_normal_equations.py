@@ -19,8 +19,9 @@ from torchstickcal.losses import (
     second_differences,
 )
 from torchstickcal.losses.reprojection import reprojection_residuals
-from torchstickcal.model.measurements import Measurements, State
+from torchstickcal.model.measurements import Measurements
 from torchstickcal.model.objective import Objective
+from torchstickcal.model.state import State
 from torchstickcal.solvers.elimination.normal_equations import NormalEquations
 
 LOSSES: dict[str, dict[str, Loss]] = {
@@ -58,8 +59,8 @@ def dense_system(objective: Objective, state: State) -> tuple[torch.Tensor, torc
                 whitened = r.detach().square().sum(-1) * confidence / loss.sigma**2
                 r = r * (loss.kernel.weight(whitened) * confidence).sqrt()[..., None]
             elif isinstance(loss, StickLengthLoss):
-                ends = points[:, m.pairs]
-                r = ((ends[:, :, 1] - ends[:, :, 0]).norm(dim=-1) - m.lengths_m[0]) * m.pair_active[0]
+                ends = points[:, m.sticks]
+                r = ((ends[:, :, 1] - ends[:, :, 0]).norm(dim=-1) - m.lengths_m[0]) * m.stick_active[0]
             else:
                 complete = active[2:] & active[1:-1] & active[:-2]
                 r = second_differences(points) * complete[..., None]
@@ -67,7 +68,7 @@ def dense_system(objective: Objective, state: State) -> tuple[torch.Tensor, torc
         return found
 
     arguments = (tangents, start_points.flatten())
-    terms = objective.terms(state.rotations, state.translations, start_points.reshape(1, *shape))
+    terms = objective.terms(state)
     cost = float(sum(terms.values()))
     jacobians = torch.autograd.functional.jacobian(lambda *x: torch.cat(residuals(*x)), arguments)
     jacobian = torch.cat([j.flatten(1) for j in jacobians], dim=1)
@@ -128,7 +129,6 @@ def test_exact_hessian_is_autograds(disturbed: tuple[Measurements, State], losse
     """At a state that is no minimum, with distorted lenses: all terms of the second derivative take part."""
     measurements, state = first_frames(*disturbed, frames=5)
     objective = Objective(measurements, losses)
-    shape = (1, measurements.frames, measurements.points_per_frame, 3)
 
     def value(unknowns: torch.Tensor) -> torch.Tensor:
         step = Se3.exp(unknowns[:18].view(3, 6)).matrix()
@@ -136,7 +136,7 @@ def test_exact_hessian_is_autograds(disturbed: tuple[Measurements, State], losse
         moved = (state.rotations[:, 1:] @ step[None, :, :3, 3:])[..., 0] + state.translations[:, 1:]
         points = state.points + unknowns[18:].view(-1, 3).mT
         translations = torch.cat([state.translations[:, :1], moved], dim=1)
-        return torch.stack(list(objective.terms(turned, translations, points[0].mT.reshape(shape)).values())).sum() / 2
+        return torch.stack(list(objective.terms(State.of(turned, translations, points)).values())).sum() / 2
 
     zero = torch.zeros(18 + state.points.numel(), dtype=torch.float64)
     hessian = torch.autograd.functional.hessian(value, zero)
@@ -157,7 +157,7 @@ def test_exact_hessian_is_autograds(disturbed: tuple[Measurements, State], losse
     direction = 0.01 * torch.randn(len(zero), generator=torch.Generator().manual_seed(1), dtype=torch.float64)
     steps = torch.cat([torch.zeros(1, 6), direction[:18].view(3, 6)])[None], direction[18:].view(1, -1, 3).mT
     (gradient,) = torch.autograd.grad(value(zero.requires_grad_()), zero)
-    along = float(objective.slope(state, *steps))
+    along = float(objective.slope(state, *steps, state.unknowns))
     assert along == pytest.approx(float(gradient @ direction), rel=1e-10)
 
 
@@ -165,14 +165,13 @@ def test_exact_hessian_is_autograds(disturbed: tuple[Measurements, State], losse
 def test_linearised_cost_and_gradient_are_autograds(disturbed: tuple[Measurements, State], losses: dict[str, Loss]):
     measurements, state = disturbed
     objective = Objective(measurements, losses)
-    points = measurements.by_frame(state.points).movedim(1, -1).clone().requires_grad_()
-    terms = objective.terms(state.rotations, state.translations, points)
+    points = state.points.clone().requires_grad_()
+    terms = objective.terms(dataclasses.replace(state, points=points))
     system = NormalEquations(objective, state, cameras_free=True)
     for name, value in terms.items():
         assert float(system.terms[name]) == pytest.approx(float(value.detach()), rel=1e-12)
     (gradient,) = torch.autograd.grad(torch.stack(list(terms.values())).sum(), points)
-    found = 2 * measurements.by_frame(system.point_gradient).movedim(1, -1)
-    torch.testing.assert_close(found, gradient, rtol=1e-9, atol=1e-9 * float(gradient.abs().max()))
+    torch.testing.assert_close(2 * system.point_gradient, gradient, rtol=1e-9, atol=1e-9 * float(gradient.abs().max()))
 
 
 @pytest.mark.parametrize("losses", LOSSES.values(), ids=LOSSES.keys())

@@ -54,7 +54,9 @@ def stick_seen_by_one() -> np.ndarray:
         ({"point_names": ["a", "b"]}, "names do not fit.*4 different names"),
         ({"camera_names": ["a", "a", "b"]}, "names do not fit"),
         ({"sticks": Stick(2, 9, 1.0)}, "not a tracked point.*from 0 to 3"),
-        ({"sticks": [Stick(0, 1, 1.0), Stick(1, 2, 1.0)]}, r"two sticks share an end.*sticks\[1\]"),
+        ({"sticks": [Stick(0, 1, 1.0), Stick(1, 0, 1.0)]}, r"two sticks have the same ends.*sticks\[1\]"),
+        ({"sticks": Stick("tip", 1, 1.0)}, r"no such point.*'tip'.*points have no names"),
+        ({"sticks": Stick("tipp", 1, 1.0), "point_names": ["a", "tip", "c", "d"]}, r"'tipp'.*Did you mean 'tip'"),
         ({"sticks": [1.0]}, "not a stick"),
     ],
 )

@@ -6,8 +6,9 @@ import pytest
 import torch
 
 from torchstickcal.losses import Cauchy, GemanMcClure, Loss, ReprojectionLoss, SmoothnessLoss, StickLengthLoss
-from torchstickcal.model.measurements import Measurements, State
+from torchstickcal.model.measurements import Measurements
 from torchstickcal.model.objective import Objective
+from torchstickcal.model.state import State
 from torchstickcal.solvers import IterationRecord, Stop, Termination, solver
 
 LOSSES: dict[str, dict[str, Loss]] = {
@@ -47,9 +48,8 @@ def test_gradient_vanishes_at_the_end(disturbed: tuple[Measurements, State], nam
     objective = Objective(measurements, LOSSES["whitened"])
 
     def gradient(state: State) -> torch.Tensor:
-        points = measurements.by_frame(state.points).movedim(1, -1).clone().requires_grad_()
-        translations = state.translations.clone().requires_grad_()
-        torch.stack(list(objective.terms(state.rotations, translations, points).values())).sum().backward()
+        points, translations = state.points.clone().requires_grad_(), state.translations.clone().requires_grad_()
+        torch.stack(list(objective.terms(State.of(state.rotations, translations, points)).values())).sum().backward()
         assert points.grad is not None
         assert translations.grad is not None
         return torch.cat([points.grad.flatten(), translations.grad[:, 1:].flatten()]).abs().max()
@@ -88,7 +88,7 @@ def test_limit_of_iterations_is_reported(disturbed: tuple[Measurements, State], 
 
 def test_a_hopeless_start_gives_a_status_and_the_state_it_had(disturbed: tuple[Measurements, State]):
     measurements, state = disturbed
-    broken = State(state.rotations, state.translations, torch.full_like(state.points, torch.nan))
+    broken = State.of(state.rotations, state.translations, torch.full_like(state.points, torch.nan))
     outcome = run("gauss_newton", Objective(measurements, LOSSES["whitened"]), broken)
     assert outcome.stops == (Stop.DIVERGED,)
     assert torch.equal(outcome.state.translations, state.translations)

@@ -9,14 +9,21 @@ from torchstickcal import Calibration, Observations, calibrate
 from torchstickcal.config import InitialiseSettings
 from torchstickcal.geometry import se3
 from torchstickcal.io import Truth
-from torchstickcal.losses import ReprojectionLoss, StickLengthLoss
-from torchstickcal.model.measurements import Measurements, State
+from torchstickcal.losses import Loss, ReprojectionLoss, StickLengthLoss
+from torchstickcal.model.measurements import Measurements
 from torchstickcal.model.objective import Objective
+from torchstickcal.model.state import State
 from torchstickcal.pipeline.initialise import triangulated
 from torchstickcal.simulate import Noise, golf_session
 from torchstickcal.solvers.elimination.normal_equations import NormalEquations
 from torchstickcal.solvers.newton import polish
-from torchstickcal.solvers.uncertainty import camera_covariance, centre_covariances, point_covariances, relative_scale_std
+from torchstickcal.solvers.uncertainty import (
+    camera_covariance,
+    centre_covariances,
+    likelihood,
+    point_covariances,
+    relative_scale_std,
+)
 
 
 def deviation(calibration: Calibration, truth: Truth) -> torch.Tensor:
@@ -34,7 +41,8 @@ def test_camera_covariance_is_the_block_of_the_whole_inverse(disturbed: tuple[Me
     """All unknowns together, the Hessian built column by column from the solver's own inverse."""
     measurements, state = disturbed
     sigma = torch.full((1, measurements.points_per_frame), 2.0, dtype=torch.float64)
-    found = camera_covariance(measurements, state, sigma, 0.01)[0]
+    losses: dict[str, Loss] = {"stick_length": StickLengthLoss(0.01), "reprojection": ReprojectionLoss()}
+    found = camera_covariance(likelihood(measurements, losses, sigma), state)[0]
     objective = Objective(measurements, {"reprojection": ReprojectionLoss(2.0), "stick_length": StickLengthLoss(0.01)})
     system = NormalEquations(objective, state, cameras_free=True)
     unit = torch.eye(18, dtype=torch.float64).view(18, 1, 3, 6)
@@ -128,4 +136,4 @@ def calibrate_points(calibration: Calibration, keypoints: torch.Tensor) -> torch
     poses = calibration.rotations[None], calibration.translations[None]
     points = triangulated(measurements, *poses, InitialiseSettings())
     objective = Objective(measurements, {"reprojection": ReprojectionLoss()})
-    return polish(objective, State(*poses, points), cameras_free=False).points[0].mT
+    return polish(objective, State.of(*poses, points), cameras_free=False).points[0].mT

@@ -133,14 +133,14 @@ def _refining(config: Config, option: str | None, no_sync: bool) -> tuple[Config
     Raises:
         CalibrationError: if clocks are both to be found and to be taken as told.
     """
-    from torchstickcal.model.unknowns import CLOCKS
+    from torchstickcal.model.unknowns import clock_refinements
 
     refine: Any = option
     if option is None:
         refine = None if config.refine else "auto"
     elif option != "auto":
         refine = [] if option == "none" else option.split(",")
-    if no_sync and refine is not None and CLOCKS & set(refine):
+    if no_sync and refine is not None and clock_refinements() & set(refine):
         raise CalibrationError(
             "clocks are to be found and to be taken as told",
             where="--no-sync",

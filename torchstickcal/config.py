@@ -7,7 +7,6 @@ with ``extends = "default"`` and state only what differs. ``false`` in place of 
 from __future__ import annotations
 
 import dataclasses
-import difflib
 import math
 import tomllib
 import types
@@ -16,16 +15,19 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from importlib import resources
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 from torchstickcal.errors import ConfigError
+from torchstickcal.losses import LOSSES, CameraPointLoss, LossSettings, ReprojectionSettings
+from torchstickcal.model.unknowns import REFINEMENTS
+from torchstickcal.registry import Registry, suggestion
 
 _EXTENDS = "extends"
 _UNIONS = (types.UnionType, typing.Union)
 
 
-Refine = Literal["focal", "focal_shared", "principal_point", "radial", "time_offset", "readout"]
-"""What may be found of a camera beside its pose, as of :data:`torchstickcal.model.unknowns.REFINEMENTS`."""
+Refine = Annotated[str, REFINEMENTS]
+"""A name in :data:`torchstickcal.model.unknowns.REFINEMENTS`."""
 
 
 @dataclass(frozen=True)
@@ -59,49 +61,24 @@ class ScaleSettings:
 
 
 @dataclass(frozen=True)
-class ReprojectionSettings:
-    """The reprojection loss; ``sigma_px = "estimated"`` takes the noise of each point from the data."""
-
-    sigma_px: float | Literal["estimated"] = "estimated"
-    kernel: Literal["none", "cauchy", "huber", "geman_mcclure"] = "none"
-    kernel_scale: float | None = None
-    weight: float = 1.0
-
-
-@dataclass(frozen=True)
-class StickLengthSettings:
-    """The stick-length loss; ``sigma_m`` is how well the length is known."""
-
-    sigma_m: float = 0.001
-    weight: float = 1.0
-
-
-@dataclass(frozen=True)
-class SmoothnessSettings:
-    """The smoothness loss; ``sigma_m`` is the standard deviation of a second difference over frames."""
-
-    sigma_m: float | Literal["estimated"] = "estimated"
-    weight: float = 1.0
-
-
-@dataclass(frozen=True)
 class Stage:
     """One minimisation.
 
+    In a configuration the losses stand in the stage's table under their own names. ``reprojection`` is there unless it is
+    removed.
+
     Args:
-        cameras: whether the cameras are adjusted or held where they are.
-        reprojection, stick_length, smoothness: the losses; None for those that take no part.
-        reject_sigmas: residual, in standard deviations, beyond which a keypoint is set aside before the stage begins; None
-            to keep all.
+        cameras: whether the cameras are estimated too, or fixed.
+        losses: the losses that are minimised, by name: settings of :data:`torchstickcal.losses.LOSSES`.
+        reject_sigmas: residual, in standard deviations, beyond which a keypoint is rejected before the stage begins; None to
+            keep all.
         rescale: whether the scene is brought to scale in closed form afterwards.
         max_iterations: limit of iterations.
         cost_tolerance: relative decrease of the cost at which the stage has converged.
     """
 
     cameras: Literal["free", "held"] = "free"
-    reprojection: ReprojectionSettings = field(default_factory=ReprojectionSettings)
-    stick_length: StickLengthSettings | None = None
-    smoothness: SmoothnessSettings | None = None
+    losses: dict[str, LossSettings] = field(default_factory=lambda: {"reprojection": ReprojectionSettings()})
     reject_sigmas: float | None = None
     rescale: bool = False
     max_iterations: int = 100
@@ -116,15 +93,16 @@ class Config:
         stages: the minimisations, in order, by name.
         points: which points take part: all, only stick ends, or only joints.
         solver: which solver minimises.
-        precision: of what there is one of per keypoint. The unknowns, and every sum over keypoints, are float64 in any case;
+        precision: of the arrays that have an entry per keypoint. Unknowns and sums over keypoints are float64 in any case.
             ``float32`` halves the memory and suits graphics cards that are slow in float64.
         initialise: the first estimate.
-        scale: a length between points, where the scale shall not come from the sticks.
-        refine: what else is found of the cameras, in every stage that adjusts them; ``auto`` for what the data contradict.
-        camera_groups: a label for each camera; those with the same share what is shared. Empty: all do.
-        synchronise: whether ``auto`` may find clocks to differ from what was told.
-        max_offset_s: largest offset of a camera from the first one that is searched for, seconds; where the motion repeats
-            itself, less than half its period.
+        scale: a length between points that sets the scale instead of the sticks.
+        refine: what else is estimated of the cameras, in every stage that estimates them; ``auto`` for what the keypoints
+            contradict.
+        camera_groups: a label for each camera; cameras with the same label share what is shared. Empty: all cameras do.
+        synchronise: whether ``auto`` may estimate clocks.
+        max_offset_s: largest time offset from the first camera that is searched for, seconds. Where the motion repeats itself,
+            choose less than half its period.
     """
 
     stages: dict[str, Stage]
@@ -167,7 +145,7 @@ def with_refine(config: Config, refine: Any) -> Config:
     Raises:
         ConfigError: if that is not a list of :data:`Refine`, or ``auto``.
     """
-    chosen = _build(typing.get_type_hints(Config)["refine"], refine, "calibrate", ("refine",))
+    chosen = _build(typing.get_type_hints(Config, include_extras=True)["refine"], refine, "calibrate", ("refine",))
     return dataclasses.replace(config, refine=chosen)
 
 
@@ -184,7 +162,7 @@ def _read(config: str | Path) -> dict[str, Any]:
             where="config",
             got=repr(str(config)),
             expected=f"a TOML file or one of {', '.join(names)}",
-            remedy=_suggestion(str(config), names),
+            remedy=suggestion(str(config), names),
         )
     try:
         keys = tomllib.loads(text)
@@ -212,6 +190,10 @@ def _merged(base: dict[str, Any], changes: dict[str, Any]) -> dict[str, Any]:
 
 def _build(kind: Any, value: Any, where: str, path: tuple[str, ...]) -> Any:
     """A value of a type built from TOML, or a ConfigError that names the key."""
+    if isinstance(kind, type) and isinstance(value, kind) and dataclasses.is_dataclass(kind):
+        return value
+    if kind is Stage:
+        return _build_stage(value, where, path)
     if dataclasses.is_dataclass(kind):
         return _build_dataclass(typing.cast(type, kind), value, where, path)
     origin, arguments = typing.get_origin(kind), typing.get_args(kind)
@@ -236,17 +218,10 @@ def _build(kind: Any, value: Any, where: str, path: tuple[str, ...]) -> Any:
 def _build_dataclass(kind: type, value: Any, where: str, path: tuple[str, ...]) -> Any:
     if not isinstance(value, dict):
         raise ConfigError("unusable value", where=f"{where}: {'.'.join(path)}", got=repr(value), expected="a table")
-    hints = typing.get_type_hints(kind)
+    hints, fields = typing.get_type_hints(kind, include_extras=True), dataclasses.fields(kind)
     for key in value:
-        if key not in hints:
-            raise ConfigError(
-                "unknown key",
-                where=f"{where}: {'.'.join((*path, key))}",
-                got=repr(key),
-                expected=f"one of {', '.join(hints)}",
-                remedy=_suggestion(key, hints),
-            )
-    required = [f.name for f in dataclasses.fields(kind) if f.default is f.default_factory is dataclasses.MISSING]
+        _check_key(key, [field.name for field in fields], where, path)
+    required = [field.name for field in fields if field.default is field.default_factory is dataclasses.MISSING]
     missing = [name for name in required if name not in value]
     if missing:
         table = ".".join(path) or "top level"
@@ -254,13 +229,52 @@ def _build_dataclass(kind: type, value: Any, where: str, path: tuple[str, ...]) 
     return kind(**{key: _build(hints[key], item, where, (*path, key)) for key, item in value.items()})
 
 
+def _build_stage(value: Any, where: str, path: tuple[str, ...]) -> Stage:
+    """A stage, in whose table the losses stand beside the stage's own settings."""
+    if not isinstance(value, dict):
+        raise ConfigError("unusable value", where=f"{where}: {'.'.join(path)}", got=repr(value), expected="a table")
+    own = [field.name for field in dataclasses.fields(Stage) if field.name != "losses"]
+    for key in value:
+        _check_key(key, [*own, *LOSSES], where, path)
+    tables = {"reprojection": {}} | {key: item for key, item in value.items() if key not in own}
+    built = {name: _build(LOSSES[name] | None, table, where, (*path, name)) for name, table in tables.items()}
+    losses = {name: settings for name, settings in built.items() if settings is not None}
+    if not any(issubclass(settings.loss, CameraPointLoss) for settings in losses.values()):
+        raise ConfigError(
+            "no loss compares points with keypoints",
+            where=f"{where}: {'.'.join(path)}",
+            got=", ".join(losses) or "no loss",
+            expected="reprojection, or another loss of a camera and a point",
+        )
+    settings = _build_dataclass(Stage, {key: item for key, item in value.items() if key in own}, where, path)
+    return dataclasses.replace(settings, losses=losses)
+
+
+def _check_key(key: str, known: list[str], where: str, path: tuple[str, ...]) -> None:
+    if key not in known:
+        raise ConfigError(
+            "unknown key",
+            where=f"{where}: {'.'.join((*path, key))}",
+            got=repr(key),
+            expected=f"one of {', '.join(known)}",
+            remedy=suggestion(key, known),
+        )
+
+
+def _registry(kind: Any) -> Registry[Any] | None:
+    """The registry whose names a type stands for; None for other types."""
+    return typing.get_args(kind)[1] if typing.get_origin(kind) is Annotated else None
+
+
 def _fits(kind: Any, value: Any) -> bool:
+    if (registry := _registry(kind)) is not None:
+        return isinstance(value, str) and value in registry
     if typing.get_origin(kind) is Literal:
         return isinstance(value, str) and value in typing.get_args(kind)
     if typing.get_origin(kind) is list:
         return isinstance(value, list | tuple)
     if dataclasses.is_dataclass(kind):
-        return isinstance(value, dict)
+        return isinstance(value, dict | typing.cast(type, kind))
     if kind is float:
         return isinstance(value, int | float) and not isinstance(value, bool) and 0 < value < math.inf
     if kind is int:
@@ -269,6 +283,8 @@ def _fits(kind: Any, value: Any) -> bool:
 
 
 def _description(kind: Any) -> str:
+    if (registry := _registry(kind)) is not None:
+        return f"one of {', '.join(registry)}"
     if typing.get_origin(kind) is Literal:
         return " or ".join(repr(option) for option in typing.get_args(kind))
     if typing.get_origin(kind) is list:
@@ -278,8 +294,3 @@ def _description(kind: Any) -> str:
     if dataclasses.is_dataclass(kind):
         return "a table"
     return {float: "a number above 0", int: "a whole number above 0", bool: "true or false", str: "a text"}.get(kind, str(kind))
-
-
-def _suggestion(key: str, known: typing.Iterable[str]) -> str:
-    near = difflib.get_close_matches(key, list(known), n=1)
-    return f"Did you mean {near[0]!r}?" if near else ""

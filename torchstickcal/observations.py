@@ -12,6 +12,7 @@ from torch import Tensor
 
 from torchstickcal.errors import ObservationError
 from torchstickcal.geometry.cameras import Intrinsics
+from torchstickcal.registry import suggestion
 
 _LONGEST_STICK_M = 10.0
 _SHORTEST_IN_MM = 300.0
@@ -19,27 +20,38 @@ _SHORTEST_IN_MM = 300.0
 
 @dataclass(frozen=True)
 class Stick:
-    """A rigid stick: two tracked points and the distance between them.
+    """A rigid stick: two tracked points and the known distance between them.
 
     Args:
-        start: index of one end among the points P.
-        end: index of the other end.
+        start: one end, as the index of a point or as its name.
+        end: the other end.
         length_m: length in metres.
+        sigma_m: standard deviation of the length, metres: how well it was measured and how rigid the stick is. A limb that
+            stands in for a stick is known to a few centimetres at best.
+
+    Raises:
+        ObservationError: if the ends are the same, or the length or its deviation are no lengths in metres.
+
+    Example:
+        >>> Stick(19, 20, 1.0)
+        Stick(start=19, end=20, length_m=1.0, sigma_m=0.001)
+        >>> Stick("right_knee", "right_ankle", 0.42, sigma_m=0.02)
+        Stick(start='right_knee', end='right_ankle', length_m=0.42, sigma_m=0.02)
     """
 
-    start: int
-    end: int
+    start: int | str
+    end: int | str
     length_m: float
+    sigma_m: float = 0.001
 
     def __post_init__(self) -> None:
         if self.start == self.end:
             raise ObservationError(
-                "a stick needs two different ends", where="Stick", got=f"start = end = {self.start}", expected="two points"
+                "a stick needs two different ends", where="Stick", got=f"start = end = {self.start!r}", expected="two points"
             )
-        if not (np.isfinite(self.length_m) and self.length_m > 0):
-            raise ObservationError(
-                "stick length is not a length", where="Stick.length_m", got=self.length_m, expected="metres, above 0"
-            )
+        for name, value in (("length_m", self.length_m), ("sigma_m", self.sigma_m)):
+            if not (np.isfinite(value) and value > 0):
+                raise ObservationError("not a length", where=f"Stick.{name}", got=value, expected="metres, above 0")
         if self.length_m > _LONGEST_STICK_M:
             unit, factor = ("millimetres", 1000) if self.length_m >= _SHORTEST_IN_MM else ("centimetres", 100)
             raise ObservationError(
@@ -50,6 +62,41 @@ class Stick:
                 remedy=f"Divide by {factor}: {self.length_m / factor:g} m.",
             )
 
+    @property
+    def ends(self) -> tuple[int, int]:
+        """Both ends as indices of points.
+
+        Raises:
+            ObservationError: if an end is a name; :class:`Observations` turns names into indices.
+        """
+        if isinstance(self.start, str) or isinstance(self.end, str):
+            raise ObservationError(
+                "a stick's end is a name", where="Stick.ends", got=f"{self.start!r}, {self.end!r}", expected="indices of points"
+            )
+        return self.start, self.end
+
+    def located(self, point_names: Sequence[str] | None) -> Stick:
+        """The stick with its ends as indices of points.
+
+        Raises:
+            ObservationError: if an end is a name that no point has.
+        """
+        start, end = (point_index(end, point_names) if isinstance(end, str) else end for end in (self.start, self.end))
+        return replace(self, start=start, end=end)
+
+
+def point_index(name: str, point_names: Sequence[str] | None) -> int:
+    """The index of a named point.
+
+    Raises:
+        ObservationError: if no point has the name.
+    """
+    if point_names is None or name not in point_names:
+        known = f"one of {', '.join(point_names)}" if point_names else "an index, since the points have no names"
+        remedy = suggestion(name, point_names) if point_names else "Give point_names."
+        raise ObservationError("no such point", where="point_names", got=repr(name), expected=known, remedy=remedy)
+    return list(point_names).index(name)
+
 
 @dataclass(frozen=True, eq=False)
 class Observations:
@@ -59,7 +106,7 @@ class Observations:
         keypoints: pixels (C, F, P, 2) as detected (distorted), NaN where a point was not seen.
         intrinsics: camera matrices, (C, 3, 3) or one (3, 3) shared by all; None if they are to be found, for which the image
             size is needed. The principal point is then taken to be the image's centre.
-        sticks: one stick or several with disjoint ends; empty if the scale comes from elsewhere.
+        sticks: one stick or several; empty if the scale comes from elsewhere.
         distortion: (C, D) or (D,), OpenCV's order, D of 4, 5 or 8; None for perfect lenses.
         confidence: (C, F, P) in [0, 1], the weight of a keypoint: its variance is divided by it. 0 is not seen.
         image_size: width and height in pixels, (C, 2) or (2,).
@@ -116,7 +163,6 @@ class Observations:
         device = self.keypoints.device
         put(self, "intrinsics_known", intrinsics_known and intrinsics is not None)
         put(self, "intrinsics", _tensor(_guess(image_size) if intrinsics is None else intrinsics, "intrinsics", device))
-        put(self, "sticks", (sticks,) if isinstance(sticks, Stick) else tuple(sticks))
         for name, value in (("distortion", distortion), ("confidence", confidence), ("image_size", image_size)):
             put(self, name, None if value is None else _tensor(value, name, device))
         put(self, "fps", None if fps is None else float(fps))
@@ -125,6 +171,7 @@ class Observations:
         put(self, "point_names", None if point_names is None else tuple(map(str, point_names)))
         put(self, "camera_names", None if camera_names is None else tuple(map(str, camera_names)))
         put(self, "fisheye", bool(fisheye))
+        put(self, "sticks", _located((sticks,) if isinstance(sticks, Stick) else tuple(sticks), self.point_names))
         self._check_keypoints()
         self._check_intrinsics()
         self._check_confidence()
@@ -162,6 +209,11 @@ class Observations:
         """The camera's name, or its number."""
         return self.camera_names[index] if self.camera_names else f"camera {index}"
 
+    @property
+    def camera_labels(self) -> tuple[str, ...]:
+        """The names of all cameras, or their numbers."""
+        return tuple(map(self.camera_label, range(self.num_cameras)))
+
     def point_label(self, index: int) -> str:
         """The point's name, or its number."""
         return self.point_names[index] if self.point_names else f"point {index}"
@@ -172,11 +224,7 @@ class Observations:
         Raises:
             ObservationError: if no point has the name.
         """
-        if self.point_names is None or name not in self.point_names:
-            raise ObservationError(
-                "no such point", where="point_names", got=repr(name), expected=f"one of {', '.join(self.point_names or ())}"
-            )
-        return self.point_names.index(name)
+        return point_index(name, self.point_names)
 
     def to(self, device: torch.device | str) -> Observations:
         """The same observations on another device."""
@@ -318,36 +366,38 @@ class Observations:
                 )
 
     def _check_sticks(self) -> None:
-        ends: list[int] = []
+        views = self.visible.sum(0)
         for number, stick in enumerate(self.sticks):
-            where = f"sticks[{number}]"
-            if not isinstance(stick, Stick):
-                raise ObservationError("not a stick", where=where, got=repr(stick), expected="Stick(start, end, length_m)")
-            if not (0 <= stick.start < self.num_points and 0 <= stick.end < self.num_points):
+            where, (start, end) = f"sticks[{number}]", stick.ends
+            if not (0 <= start < self.num_points and 0 <= end < self.num_points):
                 raise ObservationError(
                     "a stick's end is not a tracked point",
                     where=where,
-                    got=f"start {stick.start}, end {stick.end}",
+                    got=f"start {start}, end {end}",
                     expected=f"indices from 0 to {self.num_points - 1}",
                 )
-            ends += [stick.start, stick.end]
-            if len(set(ends)) != len(ends):
+            if any({start, end} == set(other.ends) for other in self.sticks[:number]):
                 raise ObservationError(
-                    "two sticks share an end",
-                    where=where,
-                    got=f"start {stick.start}, end {stick.end}",
-                    expected="disjoint ends",
+                    "two sticks have the same ends", where=where, got=f"start {start}, end {end}", expected="a stick once"
                 )
-            views = self.visible.sum(0)
-            if not bool(((views[:, stick.start] >= 2) & (views[:, stick.end] >= 2)).any()):
+            if not bool(((views[:, start] >= 2) & (views[:, end] >= 2)).any()):
                 raise ObservationError(
                     "a stick is never seen by two cameras",
                     where=where,
-                    got=f"at most {int(views[:, stick.start].max())} cameras at its start and "
-                    f"{int(views[:, stick.end].max())} at its end in one frame",
+                    got=f"at most {int(views[:, start].max())} cameras at its start and "
+                    f"{int(views[:, end].max())} at its end in one frame",
                     expected="some frame in which each end is seen by two cameras or more",
                     remedy="Check the stick's point indices and the detector's threshold.",
                 )
+
+
+def _located(sticks: Sequence[Any], point_names: Sequence[str] | None) -> tuple[Stick, ...]:
+    """Sticks with their ends as indices of points."""
+    for number, stick in enumerate(sticks):
+        if not isinstance(stick, Stick):
+            expected = "Stick(start, end, length_m)"
+            raise ObservationError("not a stick", where=f"sticks[{number}]", got=repr(stick), expected=expected)
+    return tuple(stick.located(point_names) for stick in sticks)
 
 
 def _tensor(value: Any, name: str, device: torch.device | None = None) -> Tensor:

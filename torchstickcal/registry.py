@@ -10,7 +10,7 @@ import difflib
 import importlib
 import pkgutil
 from collections.abc import Iterable, Iterator, Mapping
-from typing import TypeVar
+from typing import Any, TypeVar
 
 from torchstickcal.errors import ConfigError
 
@@ -49,6 +49,7 @@ class Registry(Mapping[str, _Thing]):
         Raises:
             ConfigError: if the name is taken.
         """
+        self._import_shipped()
         if name in self._things and not replace:
             raise ConfigError(
                 f"there is a {self.kind} of that name already",
@@ -76,6 +77,11 @@ class Registry(Mapping[str, _Thing]):
             )
         return self._things[name]
 
+    def get(self, name: str, default: Any = None) -> Any:
+        """The thing of a name, or a default if there is none."""
+        self._import_shipped()
+        return self._things.get(name, default)
+
     def __contains__(self, name: object) -> bool:
         self._import_shipped()
         return name in self._things
@@ -88,14 +94,24 @@ class Registry(Mapping[str, _Thing]):
         self._import_shipped()
         return len(self._things)
 
+    def __eq__(self, other: object) -> bool:
+        return self is other
+
+    def __hash__(self) -> int:
+        return id(self)
+
     def _import_shipped(self) -> None:
-        """Import the folder's modules, in the order of their names."""
+        """Import the folder's modules, in the order of their names; they register what they define."""
         if self._imported:
             return
         self._imported = True
-        package = importlib.import_module(self._folder)
-        for name in sorted(module.name for module in pkgutil.iter_modules(package.__path__)):
-            importlib.import_module(f"{self._folder}.{name}")
+        try:
+            package = importlib.import_module(self._folder)
+            for name in sorted(module.name for module in pkgutil.iter_modules(package.__path__)):
+                importlib.import_module(f"{self._folder}.{name}")
+        except BaseException:
+            self._imported = False
+            raise
 
 
 def suggestion(name: str, known: Iterable[str]) -> str:

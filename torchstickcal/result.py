@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import zipfile
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -21,7 +22,7 @@ from torchstickcal.observations import Stick
 from torchstickcal.solvers import IterationRecord, StageRecord, Stop
 from torchstickcal.solvers.uncertainty import centre_covariances, point_covariances, relative_scale_std
 
-_FORMAT = "torchstickcal calibration 4"
+_FORMAT = "torchstickcal calibration 5"
 _TENSORS = (
     "rotations",
     "translations",
@@ -32,21 +33,49 @@ _TENSORS = (
     "stick_lengths_m",
     "sigma_px",
     "intrinsics",
-    "lens_std",
-    "focal_ratio",
-    "focal_ratio_std",
-    "time_offsets",
-    "time_offsets_std",
-    "readout",
-    "readout_std",
-    "late",
-    "late_std",
     "frame_index",
 )
 _OPTIONAL_TENSORS = ("distortion", "image_size", "times")
 
-LENS_PARAMETERS = ("focal", "centre_x", "centre_y", "k1", "k2")
-"""What may be found of a lens, in the order of :attr:`Calibration.lens_std`."""
+
+@dataclass(frozen=True, eq=False)
+class CameraParameter:
+    """Something that may be unknown of the cameras beside their poses.
+
+    Values and standard deviations are (C,), or (C, n) where it has n > 1 components, in ``unit``.
+    """
+
+    label: str
+    """what it is, for people"""
+    unit: str
+    components: tuple[str, ...]
+    """names of the numbers that each camera has"""
+    refined: bool
+    """whether it was estimated; otherwise the given value was used"""
+    value: Tensor
+    """as estimated, or as given"""
+    std: Tensor
+    """standard deviation of the estimate; NaN where the value was given, 0 where it is so by definition, as the time offset of
+    the first camera"""
+    given: Tensor
+    prior_std: Tensor
+    """standard deviation around the given value before anything was seen"""
+    suggested: Tensor
+    """what the keypoints suggest, to first order, if this alone is changed; near ``value`` where it was estimated"""
+    suggested_std: Tensor
+
+    def to(self, dtype: torch.dtype) -> CameraParameter:
+        """The same in another floating-point type."""
+        return dataclasses.replace(self, **{name: getattr(self, name).to(dtype).contiguous() for name in _PARAMETER_TENSORS})
+
+    def by_component(self, name: str) -> Tensor:
+        """One of the tensors as (C, n), whatever n is."""
+        tensor: Tensor = getattr(self, name)
+        return tensor.view(len(tensor), -1)
+
+
+_UNKNOWN = "unknown_"
+_PARAMETER_TENSORS = ("value", "std", "given", "prior_std", "suggested", "suggested_std")
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,49 +91,33 @@ class Calibration:
     """(C, 3), world to camera, metres"""
     points: Tensor
     """(G, P, 3), metres, at the common frames; NaN where fewer than two cameras saw the point. The common frames are the F
-    frames of the session, unless the cameras' clocks were found apart or timestamps were given."""
+    frames of the session, unless time offsets were estimated or timestamps were given."""
     covariance: Tensor
     """(6 (C - 1), 6 (C - 1)), float64, of the tangents (translation, rotation; metres, radians) of all cameras but the first,
-    which is the world: ``T_true = T Exp(tangent)``. For sticks whose lengths are as given, and normal noise."""
+    which is the world: ``T_true = T Exp(tangent)``. It holds for normal noise, and for sticks whose lengths are right within
+    their stated deviations."""
     residuals_px: Tensor
-    """(C, F, P, 2), projection minus keypoint, pixels, of inliers and outliers; NaN where not seen or the point not known"""
+    """(C, F, P, 2), projection minus keypoint, pixels, of inliers and outliers; NaN where not seen or the point is not known"""
     inliers: Tensor
-    """(C, F, P), True where a keypoint took part to the end: seen by a second camera too, and agreeing with the others"""
+    """(C, F, P), True where a keypoint was used to the end: a second camera sees the point too, and it was not rejected"""
     stick_lengths_m: Tensor
     """(G, S), reconstructed lengths; NaN where an end is not known"""
     sigma_px: Tensor
     """(P,), estimated noise of each point's keypoints along an axis, pixels"""
     intrinsics: Tensor
-    """(C, 3, 3), as given or, where ``refined`` says so, as found"""
+    """(C, 3, 3), camera matrices, as given or as estimated (``refined``)"""
     distortion: Tensor | None
-    """(C, D), OpenCV's order, likewise"""
+    """(C, D), OpenCV's order, as given or as estimated; None for perfect lenses"""
     refined: tuple[str, ...]
-    """what was found of the cameras beside their poses, of :data:`torchstickcal.model.unknowns.REFINEMENTS`"""
-    lens_std: Tensor
-    """(C, 5), standard deviations of :data:`LENS_PARAMETERS` as found: focal length as a share of it, principal point in
-    pixels, k1 and k2; zero where taken as given"""
-    focal_ratio: Tensor
-    """(C,), the focal length that the data have over the one given: as found, else as far as one linearisation tells"""
-    focal_ratio_std: Tensor
-    """(C,), its standard deviation"""
-    time_offsets: Tensor
-    """(C,), how much later than told a camera's frames begin, against the first camera, seconds; as found, else zero"""
-    time_offsets_std: Tensor
-    """(C,), standard deviations, zero where taken as told"""
-    readout: Tensor
-    """(C,), time from the first row of an image to the last, seconds, as given or as found"""
-    readout_std: Tensor
-    """(C,), standard deviations, zero where taken as given"""
-    late: Tensor
-    """(C,), how much later than reckoned with a camera looks by the data, as far as one linearisation tells, seconds; about
-    zero where clocks are right or found, NaN where the session has no frame rate"""
-    late_std: Tensor
-    """(C,), its standard deviation"""
+    """what was estimated of the cameras beside their poses: names of :data:`torchstickcal.model.unknowns.REFINEMENTS`"""
+    unknowns: Mapping[str, CameraParameter]
+    """everything that can be estimated of the cameras beside their poses, by its name: ``focal``, ``principal_point``,
+    ``radial``, ``time_offset``, ``readout``"""
     frame_index: Tensor
-    """(C, F), the common frame (of G) that a camera's frame was nearest to, -1 where it was left out"""
+    """(C, F), the common frame (of G) nearest to each frame of a camera, -1 where the frame was left out"""
     times: Tensor | None
-    """(G,), float64, when the common frames are, seconds after the first camera's time 0 by its clock: when its middle row was
-    exposed; None without a frame rate"""
+    """(G,), float64, seconds on the clock of the first camera at which the middle row of its image was exposed in each common
+    frame; None without a frame rate"""
     image_size: Tensor | None
     """(C, 2), width and height, pixels"""
     fisheye: bool
@@ -135,6 +148,11 @@ class Calibration:
         return tuple(record for stage in self.stages for record in stage.iterations)
 
     @property
+    def time_offsets(self) -> Tensor:
+        """(C,), time by which each camera's frames begin after those of the first camera, seconds; zero where not estimated."""
+        return self.unknowns["time_offset"].value
+
+    @property
     def camera_centres(self) -> Tensor:
         """(C, 3), metres."""
         return se3.camera_centres(self.rotations, self.translations) + 0.0
@@ -147,18 +165,18 @@ class Calibration:
 
     @property
     def camera_std_m(self) -> Tensor:
-        """(C,), standard deviation of the distance of each camera's centre from where it is, in the first camera's frame."""
+        """(C,), standard deviation of each camera's centre from its true position, in the first camera's frame, metres."""
         covariances = centre_covariances(self.camera_centres.double(), self.covariance)
         return covariances.diagonal(dim1=1, dim2=2).sum(1).sqrt().to(self.rotations.dtype)
 
     @property
     def scale_std(self) -> Tensor:
-        """(), standard deviation of the rig's scale as a share of it, the sticks' lengths being as given."""
+        """(), standard deviation of the rig's scale, as a fraction of it."""
         return relative_scale_std(self.camera_centres.double(), self.covariance).to(self.rotations.dtype)
 
     @property
     def points_std_m(self) -> Tensor:
-        """(G, P), standard deviation of the distance of each point from where it is, stick lengths and smoothness aside."""
+        """(G, P), standard deviation of each point from its true position, metres, without what sticks and smoothness add."""
         frames, points = self.points.shape[:2]
         sigma_px = self.sigma_px.double().expand(frames, points).flatten()
         seen = self.inliers.new_zeros(len(self.inliers), frames, points)
@@ -168,16 +186,16 @@ class Calibration:
         return found.diagonal(dim1=1, dim2=2).sum(1).sqrt().to(self.points.dtype).view(frames, points)
 
     def predict_std(self, points: Tensor, sigma_px: float | None = None) -> Tensor:
-        """How well points would be triangulated: standard deviations (..., 3) along the axes, metres.
+        """How precisely points would be triangulated: standard deviations (..., 3) along the axes, metres.
 
-        A point counts as seen by every camera that has it in front of it and, where the image sizes are known, in its image.
+        A point counts as seen by every camera in front of which it lies and, where the image sizes are known, in whose image.
 
         Args:
             points: (..., 3), metres, in the frame of the first camera.
             sigma_px: noise of their keypoints along an axis, pixels; None for the median over the calibration's points.
 
         Returns:
-            Standard deviations with the cameras' uncertainty in them; NaN where fewer than two cameras see the point.
+            Standard deviations, the uncertainty of the cameras included; NaN where fewer than two cameras see the point.
         """
         flat = points.detach().double().reshape(-1, 3).to(self.points.device)
         moved = se3.moved(self.rotations.double()[None], self.translations.double()[None], flat.mT[None])[0]
@@ -213,10 +231,17 @@ class Calibration:
         """Write everything to one ``.npz`` file."""
         tensors = {name: getattr(self, name) for name in (*_TENSORS, *_OPTIONAL_TENSORS)}
         arrays = {name: tensor.detach().cpu().numpy() for name, tensor in tensors.items() if tensor is not None}
+        for name, parameter in self.unknowns.items():
+            values = (getattr(parameter, field).detach() for field in _PARAMETER_TENSORS)
+            arrays[f"{_UNKNOWN}{name}"] = torch.stack(list(values)).cpu().numpy()
         meta = {
             "format": _FORMAT,
             "fisheye": self.fisheye,
             "refined": self.refined,
+            "unknowns": {
+                name: {"label": p.label, "unit": p.unit, "components": p.components, "refined": p.refined}
+                for name, p in self.unknowns.items()
+            },
             "sticks": [dataclasses.astuple(stick) for stick in self.sticks],
             "fps": self.fps,
             "point_names": self.point_names,
@@ -248,6 +273,7 @@ class Calibration:
                 times=arrays.get("times"),
                 fisheye=meta["fisheye"],
                 refined=tuple(meta["refined"]),
+                unknowns={name: _parameter(about, arrays[f"{_UNKNOWN}{name}"]) for name, about in meta["unknowns"].items()},
                 sticks=tuple(Stick(*stick) for stick in meta["sticks"]),
                 fps=meta["fps"],
                 point_names=None if meta["point_names"] is None else tuple(meta["point_names"]),
@@ -260,6 +286,11 @@ class Calibration:
             raise FileFormatError(
                 "not a saved calibration", where=str(path), got=repr(error), expected="a file written by Calibration.save"
             ) from error
+
+
+def _parameter(about: dict[str, Any], values: Tensor) -> CameraParameter:
+    tensors = dict(zip(_PARAMETER_TENSORS, values, strict=True))
+    return CameraParameter(**about | {"components": tuple(about["components"])}, **tensors)
 
 
 def _stage_record(stage: dict[str, Any]) -> StageRecord:

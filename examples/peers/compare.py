@@ -30,8 +30,9 @@ from torchstickcal import calibrate as calibrate_here
 from torchstickcal.errors import FileFormatError
 from torchstickcal.losses import ReprojectionLoss, StickLengthLoss
 from torchstickcal.metrics import PoseErrors, pose_errors
-from torchstickcal.model.measurements import Measurements, State
+from torchstickcal.model.measurements import Measurements
 from torchstickcal.model.objective import Objective
+from torchstickcal.model.state import State
 from torchstickcal.simulate import SimulatedSession, read_simulated
 from torchstickcal.solvers.elimination.normal_equations import NormalEquations
 
@@ -132,7 +133,7 @@ def bound(session: SimulatedSession) -> float:
     measurements = replace(measurements, confidence=measurements.visible / sigma_px.square())
     objective = Objective(measurements, {"reprojection": ReprojectionLoss(), "stick_length": StickLengthLoss(STICK_SIGMA_M)})
     points = truth.points.flatten(0, 1).mT.contiguous()
-    state = State(truth.rotations[None], truth.translations[None], points[None])
+    state = State.of(truth.rotations[None], truth.translations[None], points[None])
     covariance = torch.linalg.inv(NormalEquations(objective, state, cameras_free=True).reduced[0])
     draws = np.random.default_rng(0).multivariate_normal(np.zeros(len(covariance)), covariance.numpy(), DRAWS)
     return statistics.fmean(_errors_at(state, tangents).mean_translation_m for tangents in torch.from_numpy(draws))

@@ -11,9 +11,10 @@ from torchstickcal.benchmark.cases import Case
 from torchstickcal.geometry import se3
 from torchstickcal.losses import ReprojectionLoss, StickLengthLoss
 from torchstickcal.metrics import pose_errors
-from torchstickcal.model.measurements import Measurements, State
+from torchstickcal.model.measurements import Measurements
 from torchstickcal.model.objective import Objective
-from torchstickcal.model.unknowns import CameraUnknowns
+from torchstickcal.model.state import State
+from torchstickcal.model.unknowns import RigUnknowns
 from torchstickcal.solvers.elimination.normal_equations import NormalEquations
 
 _SIGMA_LENGTH_M = 1e-5
@@ -53,12 +54,12 @@ def camera_bound(case: Case, draws: int = 2000, seed: int = 0, unknown: Sequence
     sigma_px = torch.from_numpy(case.sigma_px).flatten(1).clamp_min(1e-6)
     measurements = replace(measurements, confidence=measurements.visible / sigma_px.square())
     if unknown:
-        unknowns = CameraUnknowns.of(unknown, measurements.cameras)
+        unknowns = RigUnknowns.of(unknown, measurements.cameras)
         unknowns = replace(unknowns, prior_sigma=torch.full_like(unknowns.prior_sigma, torch.inf))
         measurements = replace(measurements, unknowns=unknowns)
     objective = Objective(measurements, {"reprojection": ReprojectionLoss(), "stick_length": StickLengthLoss(_SIGMA_LENGTH_M)})
     points = truth.points.flatten(0, 1).mT.contiguous()
-    state = State(truth.rotations[None], truth.translations[None], points[None])
+    state = State(truth.rotations[None], truth.translations[None], points[None], measurements.unknowns.given)
     factor, failed = torch.linalg.cholesky_ex(NormalEquations(objective, state, cameras_free=True).reduced[0])
     if int(failed):
         return None

@@ -87,7 +87,11 @@ class Intrinsics:
     def project_components(self, x: Tensor, y: Tensor, z: Tensor) -> tuple[Tensor, Tensor]:
         """Pixel coordinates of points given as three tensors (..., C, ...)."""
         inverse_depth = inverse_depths(z)
-        return self._to_pixels(*self.distort(x * inverse_depth, y * inverse_depth))
+        return self.pixels(x * inverse_depth, y * inverse_depth)
+
+    def pixels(self, u: Tensor, v: Tensor) -> tuple[Tensor, Tensor]:
+        """Pixel coordinates of normalised coordinates, two tensors (..., C, ...)."""
+        return self._to_pixels(*self.distort(u, v))
 
     def pixels_with_jacobian(self, u: Tensor, v: Tensor) -> PixelMap:
         """Pixel coordinates of normalised coordinates (..., C, N), with their derivatives."""

@@ -1,22 +1,22 @@
-"""Sessions in the solvers' layout: coordinates before points, points of all frames side by side.
+"""What was measured, in the layout of the solvers: coordinates before points, the points of all frames side by side.
 
-Everything a solver touches in its inner loop is a tensor (B, C, k, N), (B, k, N) or (B, N): B sessions of equal shape, C
-cameras, N = F P columns with the frame varying slowest, so that a slice of frames is a contiguous slice of columns. One session
-is a batch of one.
+A solver's tensors are (B, C, k, N), (B, k, N) or (B, N): B sessions of equal shape, C cameras, and N = F P columns, the P
+points of frame 0, then those of frame 1, and so on, so that a slice of frames is a slice of columns. One session is a batch of
+one.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterator, Sequence
-from dataclasses import dataclass, fields, replace
+from collections.abc import Collection, Iterator, Sequence
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import torch
 from torch import Tensor
 
-from torchstickcal.geometry import se3
 from torchstickcal.geometry.cameras import Intrinsics
-from torchstickcal.model.unknowns import CameraUnknowns, Columns, ImageMotion
+from torchstickcal.model.state import State
+from torchstickcal.model.unknowns import Columns, ImageMotion, RigUnknowns
 from torchstickcal.observations import Observations
 
 _CHUNK_KEYPOINTS = {"cpu": 32_000, "cuda": 1_000_000}
@@ -32,9 +32,10 @@ class Measurements:
         confidence: (B, C, N), zero where not seen and at points fewer than two cameras see.
         cameras: intrinsics of the B sessions' C cameras.
         frames: F.
-        pairs: (S, 2), the points that are ends of one stick.
-        lengths_m: (B, S), the sticks' lengths.
-        unknowns: what is not known of the cameras beside their poses; None where that is nothing.
+        sticks: (S, 2), the points that are the ends of a stick.
+        lengths_m: (B, S), the sticks' lengths, metres.
+        stick_sigma_m: (S,), the tolerances of these lengths, metres.
+        unknowns: what is unknown of the cameras beside their poses.
         motion: of the keypoints, where clocks are among the unknowns.
     """
 
@@ -42,9 +43,10 @@ class Measurements:
     confidence: Tensor
     cameras: Intrinsics
     frames: int
-    pairs: Tensor
+    sticks: Tensor
     lengths_m: Tensor
-    unknowns: CameraUnknowns | None = None
+    stick_sigma_m: Tensor
+    unknowns: RigUnknowns
     motion: ImageMotion | None = None
 
     @staticmethod
@@ -64,14 +66,18 @@ class Measurements:
         visible = visible & (visible.sum(0) >= 2)
         keypoints = observations.keypoints.to(dtype)
         confidence = visible.to(dtype) if observations.confidence is None else observations.confidence.to(dtype)
-        sticks = [s for s in observations.sticks if use is None or {s.start, s.end} <= set(use)]
+        sticks = [s for s in observations.sticks if use is None or set(s.ends) <= set(use)]
+        cameras = observations.cameras.batched()
+        device = keypoints.device
         return Measurements(
             pixels=torch.where(visible[..., None], keypoints, 0.0).movedim(-1, 1).flatten(2).contiguous()[None],
             confidence=torch.where(visible, confidence, 0.0).flatten(1)[None],
-            cameras=observations.cameras.batched(),
+            cameras=cameras,
             frames=observations.num_frames,
-            pairs=torch.tensor([(s.start, s.end) for s in sticks], dtype=torch.long).view(-1, 2).to(keypoints.device),
-            lengths_m=torch.tensor([[s.length_m for s in sticks]], dtype=torch.float64).to(keypoints.device),
+            sticks=torch.tensor([s.ends for s in sticks], dtype=torch.long).view(-1, 2).to(device),
+            lengths_m=torch.tensor([[s.length_m for s in sticks]], dtype=torch.float64).to(device),
+            stick_sigma_m=torch.tensor([s.sigma_m for s in sticks], dtype=torch.float64).to(device),
+            unknowns=RigUnknowns.of((), cameras),
         )
 
     @staticmethod
@@ -90,16 +96,16 @@ class Measurements:
         pixels, confidence, lengths_m = (
             torch.cat([getattr(session, name) for session in sessions]) for name in ("pixels", "confidence", "lengths_m")
         )
-        unknowns = [session.unknowns for session in sessions if session.unknowns is not None]
         motions = [session.motion for session in sessions if session.motion is not None]
         return Measurements(
             pixels,
             confidence,
             cameras,
             first.frames,
-            first.pairs,
+            first.sticks,
             lengths_m,
-            CameraUnknowns.stack(unknowns) if unknowns else None,
+            first.stick_sigma_m,
+            RigUnknowns.stack([session.unknowns for session in sessions]),
             ImageMotion(*map(torch.cat, zip(*motions, strict=True))) if motions else None,
         )
 
@@ -111,7 +117,7 @@ class Measurements:
             confidence=self.confidence[sessions],
             cameras=self.cameras[sessions],
             lengths_m=self.lengths_m[sessions],
-            unknowns=self.unknowns and self.unknowns[sessions],
+            unknowns=self.unknowns[sessions],
             motion=self.motion and ImageMotion(*(tensor[sessions] for tensor in self.motion)),
         )
 
@@ -157,16 +163,14 @@ class Measurements:
 
     def cameras_at(self, state: State) -> Intrinsics:
         """The cameras as a state has them, in the dtype of the pixels."""
-        if self.unknowns is None or state.unknowns is None:
+        if not self.unknowns.count:
             return self._cameras_in_dtype
         return self.unknowns.applied(self.cameras, state.unknowns).to(self.pixels.dtype)
 
     def pixels_at(self, state: State, columns: Columns = slice(None)) -> Tensor:
         """Keypoints (B, C, 2, n) of some columns, on the clocks as a state has them."""
-        pixels = self.pixels[..., columns]
-        if self.unknowns is None or state.unknowns is None or self.motion is None:
-            return pixels
-        return self.unknowns.displaced(pixels, state.unknowns, self.motion.at(columns))
+        motion = self.motion and self.motion.at(columns)
+        return self.unknowns.displaced(self.pixels[..., columns], state.unknowns, motion)
 
     @cached_property
     def _cameras_in_dtype(self) -> Intrinsics:
@@ -183,9 +187,9 @@ class Measurements:
         return self.visible.any(-2)
 
     @cached_property
-    def pair_active(self) -> Tensor:
+    def stick_active(self) -> Tensor:
         """(B, F, S), True where both ends of a stick are active."""
-        return self.by_frame(self.active)[..., self.pairs].all(-1)
+        return self.by_frame(self.active)[..., self.sticks].all(-1)
 
     @property
     def sessions(self) -> int:
@@ -225,71 +229,9 @@ class Measurements:
 
     def stick_lengths_m(self, points: Tensor) -> Tensor:
         """Lengths (B, F, S) of the sticks among points (B, 3, N); NaN in frames where an end is not active."""
-        ends = self.by_frame(points)[..., self.pairs]
-        return (ends[..., 1] - ends[..., 0]).square().sum(1).sqrt().where(self.pair_active, torch.nan)
+        ends = self.by_frame(points)[..., self.sticks]
+        return (ends[..., 1] - ends[..., 0]).square().sum(1).sqrt().where(self.stick_active, torch.nan)
 
     def by_frame(self, columns: Tensor) -> Tensor:
         """A tensor (..., N) as (..., F, P)."""
         return columns.unflatten(-1, (self.frames, -1))
-
-
-@dataclass(frozen=True)
-class State:
-    """What is looked for, in float64.
-
-    Args:
-        rotations: (B, C, 3, 3), world to camera.
-        translations: (B, C, 3), world to camera, metres.
-        points: (B, 3, N), metres.
-        unknowns: (B, K), values of the measurements' further unknowns; None for cameras as given.
-    """
-
-    rotations: Tensor
-    translations: Tensor
-    points: Tensor
-    unknowns: Tensor | None = None
-
-    @staticmethod
-    def stack(states: Sequence[State]) -> State:
-        """The states of several sessions as those of one batch."""
-        return _each(lambda *tensors: torch.cat(tensors), *states)
-
-    def __getitem__(self, sessions: slice) -> State:
-        """Those of some of the sessions."""
-        return _each(lambda tensor: tensor[sessions], self)
-
-    def replaced(self, where: Tensor, other: State) -> State:
-        """The state with some sessions (B,), True where, taken from another."""
-        return _each(lambda mine, theirs: torch.where(where.view(-1, *[1] * (mine.ndim - 1)), theirs, mine), self, other)
-
-    def scaled(self, factors: Tensor) -> State:
-        """The same scenes, each its factor (B,) times as large."""
-        factor = factors[:, None, None]
-        return replace(self, translations=self.translations * factor, points=self.points * factor)
-
-    def retracted(self, camera_step: Tensor, point_step: Tensor, unknown_step: Tensor | None = None) -> State:
-        """The state after a step.
-
-        Args:
-            camera_step: tangents (B, C - 1, 6) of all cameras but the first, or (B, 0, 6).
-            point_step: (B, 3, N).
-            unknown_step: (B, K), or (B, 0) for none.
-        """
-        rotations, translations, unknowns = self.rotations, self.translations, self.unknowns
-        if camera_step.shape[1]:
-            moved = se3.retract(rotations[:, 1:], translations[:, 1:], camera_step)
-            rotations = torch.cat([rotations[:, :1], moved[0]], dim=1)
-            translations = torch.cat([translations[:, :1], moved[1]], dim=1)
-        if unknown_step is not None and unknown_step.shape[1]:
-            unknowns = unknown_step if unknowns is None else unknowns + unknown_step
-        return State(rotations, translations, self.points + point_step, unknowns)
-
-    def in_cameras(self, columns: Columns = slice(None), dtype: torch.dtype = torch.float64) -> Tensor:
-        """The points in every camera's frame, (B, C, 3, N), computed in float64 and then rounded."""
-        return se3.moved(self.rotations, self.translations, self.points[..., columns]).to(dtype)
-
-
-def _each(function: Callable[..., Tensor], *states: State) -> State:
-    """A state made of others, tensor by tensor."""
-    tensors = [[getattr(state, field.name) for state in states] for field in fields(State)]
-    return State(*(None if of[0] is None else function(*of) for of in tensors))  # pyright: ignore[reportArgumentType]

@@ -7,8 +7,10 @@ import math
 import torch
 from torch import Tensor
 
-from torchstickcal.losses.smoothness import complete_triples, stencil
-from torchstickcal.model.measurements import Measurements, State
+from torchstickcal.losses import SmoothnessLoss
+from torchstickcal.losses.base import combined, consecutive
+from torchstickcal.model.measurements import Measurements
+from torchstickcal.model.state import State
 
 _CUT = 4.0
 _ROUNDS = 5
@@ -78,9 +80,9 @@ def estimate_acceleration_m(measurements: Measurements, points: Tensor, point_co
         points: (B, 3, N).
         point_covariance: mean variance along the axes of each point as triangulated, (B, N), square metres.
     """
-    complete = complete_triples(measurements.by_frame(measurements.active))
+    complete = consecutive(measurements.by_frame(measurements.active), len(SmoothnessLoss.stencil))
     x, noise = measurements.by_frame(points), measurements.by_frame(point_covariance)
-    measured = stencil(x, dim=-2).square().mean(1)
+    measured = combined(x, SmoothnessLoss.stencil, dim=-2).square().mean(1)
     expected = noise[:, 2:] + 4 * noise[:, 1:-1] + noise[:, :-2]
     weights = complete / expected.clamp_min(_MIN_ACCELERATION_M**2)
     total = weights.sum(1).clamp_min(1e-300)

@@ -1,26 +1,29 @@
-"""The objective: the losses of a stage, bound to one batch of sessions.
+"""The objective: the losses of a stage, applied to one batch of sessions.
 
-It can be asked for its value in two ways that the tests hold equal: as scalars through autograd, for LBFGS and training
-loops, and linearised block by block, for the Gauss-Newton solver.
+Its value comes in two forms that the tests hold equal: as scalars that autograd can differentiate, for LBFGS and training
+loops, and linearised block by block, for Gauss-Newton.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from functools import partial
+from dataclasses import dataclass
+from functools import cached_property
 from typing import TypeVar
 
 import torch
 from torch import Tensor
 
 from torchstickcal.geometry import se3
-from torchstickcal.losses import CameraPointLoss, Loss, PairLoss, TrackLoss
-from torchstickcal.losses.base import CameraPointTerms, PairTerms, TrackTerms, UnknownTerms
-from torchstickcal.model.measurements import Measurements, State
-from torchstickcal.model.unknowns import CameraUnknowns, Columns
+from torchstickcal.geometry.cameras import Intrinsics, PixelMap
+from torchstickcal.losses import CameraPointLoss, FrameLoss, Loss, TrackLoss
+from torchstickcal.losses.base import CameraPointTerms, FrameTerms, TrackTerms, UnknownTerms
+from torchstickcal.model.measurements import Measurements
+from torchstickcal.model.state import State
+from torchstickcal.model.unknowns import Columns, ImageMotion, RigUnknowns
 
 PRIOR = "prior"
-"""Name of the term that holds the cameras' further unknowns to what was given."""
+"""Name of the term that keeps the further unknowns of the cameras near what was given."""
 
 _Kind = TypeVar("_Kind", bound=Loss)
 
@@ -37,8 +40,11 @@ class Objective:
         self.measurements = measurements
         self.losses = dict(losses)
         self._camera_point = self._of_kind(CameraPointLoss)
-        self._pair = self._of_kind(PairLoss) if len(measurements.pairs) else {}
-        self._track = self._of_kind(TrackLoss) if measurements.frames > 2 else {}
+        frame = self._of_kind(FrameLoss)
+        self.groups = {name: loss.groups(measurements.sticks) for name, loss in frame.items()}
+        """the points (G, k) that each frame loss couples"""
+        self._frame = {name: loss for name, loss in frame.items() if len(self.groups[name])}
+        self._track = {n: loss for n, loss in self._of_kind(TrackLoss).items() if len(loss.stencil) <= measurements.frames}
         self._information = {name: self._by_column(loss) for name, loss in self._camera_point.items()}
 
     def __getitem__(self, sessions: slice) -> Objective:
@@ -46,138 +52,120 @@ class Objective:
         return Objective(self.measurements[sessions], {name: loss.of(sessions) for name, loss in self.losses.items()})
 
     @property
-    def couples_frames(self) -> bool:
-        """Whether a loss ties one frame to another."""
-        return bool(self._track)
+    def track_losses(self) -> dict[str, TrackLoss]:
+        """The losses that couple consecutive frames."""
+        return self._track
 
-    def terms(
-        self, rotations: Tensor, translations: Tensor, points: Tensor, unknowns: Tensor | None = None
-    ) -> dict[str, Tensor]:
-        """The value of every loss, summed over the sessions, differentiable.
+    @cached_property
+    def clusters(self) -> list[tuple[int, ...]]:
+        """The points of one frame that losses couple with one another, directly or through others; two or more each."""
+        cluster_of = {point: {point} for point in range(self.measurements.points_per_frame)}
+        for name in self._frame:
+            for group in self.groups[name].tolist():
+                together = set().union(*(cluster_of[point] for point in group))
+                for point in together:
+                    cluster_of[point] = together
+        found = {min(cluster): tuple(sorted(cluster)) for cluster in cluster_of.values() if len(cluster) > 1}
+        return [found[first] for first in sorted(found)]
 
-        Args:
-            rotations: (B, C, 3, 3).
-            translations: (B, C, 3).
-            points: (B, F, P, 3).
-            unknowns: (B, K), what else is unknown of the cameras; None for cameras as given.
-        """
+    def terms(self, state: State) -> dict[str, Tensor]:
+        """The value of every loss at a state, summed over the sessions, differentiable by the state and the measurements."""
         m = self.measurements
-        cameras, pixels = m.cameras, m.pixels
-        if m.unknowns is not None and unknowns is not None:
-            cameras = m.unknowns.applied(cameras, unknowns)
-            pixels = m.unknowns.displaced(pixels, unknowns, m.motion)
+        cameras = m.unknowns.applied(m.cameras, state.unknowns)
         confidence = m.by_frame(m.confidence)
-        keypoints = m.by_frame(pixels).movedim(2, -1).where(confidence[..., None] > 0, torch.nan)
-        points = points.where(m.by_frame(m.active)[..., None], torch.nan)
-        starts, ends = m.pairs.unbind(1)
+        keypoints = m.by_frame(m.pixels_at(state)).movedim(2, -1).where(confidence[..., None] > 0, torch.nan)
+        points = m.by_frame(state.points).movedim(1, -1).where(m.by_frame(m.active)[..., None], torch.nan)
         values: dict[str, Tensor] = {}
         for name, loss in self._camera_point.items():
-            values[name] = loss(points, rotations, translations, keypoints, cameras, confidence)
-        for name, loss in self._pair.items():
-            values[name] = loss(points[..., starts, :], points[..., ends, :], m.lengths_m[:, None])
+            values[name] = loss(points, state.rotations, state.translations, keypoints, cameras, confidence)
+        for name, loss in self._frame.items():
+            values[name] = loss.of_session(points, m.sticks, m.lengths_m[:, None])
         for name, loss in self._track.items():
             values[name] = loss(points)
-        if m.unknowns is not None and unknowns is not None:
-            values[PRIOR] = (unknowns / m.unknowns.prior_sigma).square().sum()
+        if m.unknowns.count:
+            values[PRIOR] = (state.unknowns / m.unknowns.prior_sigma).square().sum()
         return values
 
-    def slope(self, state: State, camera_step: Tensor, point_step: Tensor, unknown_step: Tensor | None = None) -> Tensor:
+    def slope(self, state: State, camera_step: Tensor, point_step: Tensor, unknown_step: Tensor) -> Tensor:
         """Half the derivative of the objective along a step from a state, differentiable by measurements and state.
 
         Args:
             state: where.
             camera_step: (B, C, 6), tangents.
             point_step: (B, 3, N).
-            unknown_step: (B, K), of what else is unknown of the cameras; None where it stays as it is.
+            unknown_step: (B, K), of what else is unknown of the cameras.
         """
         m = self.measurements
         moved = point_step[:, None] + se3.moved(se3.hat(camera_step[..., 3:]), camera_step[..., :3], state.points)
         points_cam, moved_cam = state.in_cameras(), state.rotations @ moved
-        cameras, pixels, image_step = m.cameras_at(state), m.pixels_at(state), None
-        total = points_cam.new_zeros(())
-        if m.unknowns is not None and unknown_step is not None:
-            image_step = partial(m.unknowns.moved, cameras=cameras, motion=m.motion, step=unknown_step)
-            total = total + (_values(state, m.unknowns) * unknown_step / m.unknowns.prior_sigma.square()).sum()
+        at = self._unknowns_at(state)
+        step = m.unknowns.by_camera(unknown_step)
+        total = (state.unknowns * unknown_step / m.unknowns.prior_sigma.square()).sum()
         for name, loss in self._camera_point.items():
             information = m.confidence * self._information[name]
-            total = total + loss.slope(points_cam, moved_cam, pixels, information, cameras, image_step)
-        for loss in self._pair.values():
-            difference, moved_ends = self._differences(state.points), self._differences(point_step)
-            total = total + loss.slope(difference, moved_ends, m.lengths_m[:, None], m.pair_active)
+            total = total + loss.slope(points_cam, moved_cam, at.pixels, information, at.cameras, at.if_any, step)
+        points, point_step, active = m.by_frame(state.points), m.by_frame(point_step), m.by_frame(m.active)
+        for loss in self._frame.values():
+            total = total + loss.slope(points, point_step, m.sticks, m.lengths_m[:, None], active)
         for loss in self._track.values():
-            total = total + loss.slope(m.by_frame(state.points), m.by_frame(point_step), m.by_frame(m.active))
+            total = total + loss.slope(points, point_step, active)
         return total
 
     def linearise_chunk(
         self, state: State, columns: Columns, exact: bool = False, by_unknowns: bool = True
     ) -> dict[str, CameraPointTerms]:
-        """The camera-point losses, linearised at some of the columns N, if wanted by the cameras' further unknowns too."""
+        """The camera-point losses, linearised at some of the columns N, if wanted also by the cameras' further unknowns."""
         m = self.measurements
-        pixels, confidence = m.pixels_at(state, columns), m.confidence[..., columns]
-        points_cam, rotations = state.in_cameras(columns, pixels.dtype), state.rotations.to(pixels.dtype)
-        cameras, further = m.cameras_at(state), None
-        unknowns = m.unknowns if by_unknowns else None
-        if unknowns is not None and not exact:
-            further = partial(unknowns.columns, cameras=cameras, motion=m.motion and m.motion.at(columns))
+        at, confidence = self._unknowns_at(state, columns), m.confidence[..., columns]
+        points_cam, rotations = state.in_cameras(columns, at.pixels.dtype), state.rotations.to(at.pixels.dtype)
+        unknowns = at.if_any if by_unknowns else None
         found: dict[str, CameraPointTerms] = {}
         for name, loss in self._camera_point.items():
             information = confidence * self._information[name][..., columns]
-            terms = loss.linearise(points_cam, rotations, pixels, information, cameras, exact, further)
+            further = None if exact else unknowns
+            terms = loss.linearise(points_cam, rotations, at.pixels, information, at.cameras, exact, further)
             if unknowns is not None and exact:
-                terms = terms._replace(unknown=self._exact_by_unknowns(loss, unknowns, state, columns, information))
+                terms = terms._replace(unknown=self._exact_by_unknowns(loss, state, columns, information))
             found[name] = terms
         return found
 
     @torch.enable_grad()
-    def _exact_by_unknowns(
-        self, loss: CameraPointLoss, unknowns: CameraUnknowns, state: State, columns: Columns, information: Tensor
-    ) -> UnknownTerms:
+    def _exact_by_unknowns(self, loss: CameraPointLoss, state: State, columns: Columns, information: Tensor) -> UnknownTerms:
         """A loss's terms with the exact Hessian at columns of information (B, C, n): the slope's derivatives, by autograd."""
         m = self.measurements
-        each, motion = unknowns.unshared(), m.motion and m.motion.at(columns)
-        if motion is not None:
-            motion = motion._replace(reckoned=unknowns.by_camera(motion.reckoned).flatten(1))
         points_cam = state.in_cameras(columns).detach().requires_grad_()
-        values = unknowns.by_camera(_values(state, unknowns)).detach().requires_grad_()
-        step = torch.zeros_like(values).requires_grad_()
-        cameras = each.applied(m.cameras, values.flatten(1))
-        pixels = each.displaced(m.pixels[..., columns], values.flatten(1), motion)
-        image_step = partial(each.moved, cameras=cameras, motion=motion, step=step.flatten(1))
-        slope = loss.slope(points_cam, torch.zeros_like(points_cam), pixels, information, cameras, image_step)
+        at = self._unknowns_at(state, columns)
+        deviations = torch.zeros_like(m.unknowns.by_camera(state.unknowns)).requires_grad_()
+        step = torch.zeros_like(deviations).requires_grad_()
+        moved = at.at(deviations)
+        still = torch.zeros_like(points_cam)
+        slope = loss.slope(points_cam, still, moved.pixels, information, moved.cameras, moved, step)
         (gradient,) = torch.autograd.grad(slope, step, create_graph=True)
-        rows = [torch.autograd.grad(row.sum(), (values, points_cam), retain_graph=True) for row in gradient.unbind(-1)]
+        rows = [torch.autograd.grad(row.sum(), (deviations, points_cam), retain_graph=True) for row in gradient.unbind(-1)]
         hessian, by_points = (torch.stack(of, dim=2) for of in zip(*rows, strict=True))
         return UnknownTerms(gradient.detach(), hessian, state.rotations.mT.unsqueeze(2) @ by_points)
 
-    def linearise_prior(self, state: State) -> tuple[Tensor, Tensor, Tensor] | None:
+    def linearise_prior(self, state: State) -> tuple[Tensor, Tensor, Tensor]:
         """The prior of the cameras' further unknowns: its value (B,), half its gradient (B, K), and its information (B, K)."""
-        unknowns = self.measurements.unknowns
-        if unknowns is None:
-            return None
-        information = unknowns.prior_sigma.square().reciprocal()
-        values = _values(state, unknowns)
-        return (information * values.square()).sum(1), information * values, information
+        information = self.measurements.unknowns.prior_sigma.square().reciprocal()
+        return (information * state.unknowns.square()).sum(1), information * state.unknowns, information
 
-    def linearise_pairs(self, state: State, exact: bool = False) -> dict[str, PairTerms]:
-        """The pair losses, linearised."""
-        if not self._pair:
-            return {}
+    def linearise_frames(self, state: State, exact: bool = False) -> dict[str, FrameTerms]:
+        """The frame losses, linearised."""
         m = self.measurements
-        arguments = self._differences(state.points), m.lengths_m[:, None], m.pair_active, exact
-        return {name: loss.linearise(*arguments) for name, loss in self._pair.items()}
+        arguments = m.by_frame(state.points), m.sticks, m.lengths_m[:, None], m.by_frame(m.active), exact
+        return {name: loss.linearise(*arguments) for name, loss in self._frame.items()}
 
     def linearise_tracks(self, state: State) -> dict[str, TrackTerms]:
         """The track losses, linearised."""
-        if not self._track:
-            return {}
         m = self.measurements
-        active = m.by_frame(m.active)
-        return {name: loss.linearise(m.by_frame(state.points), active) for name, loss in self._track.items()}
+        arguments = m.by_frame(state.points), m.by_frame(m.active)
+        return {name: loss.linearise(*arguments) for name, loss in self._track.items()}
 
-    def _differences(self, points: Tensor) -> Tensor:
-        """From one end of every stick to the other, (B, 3, F, S), of points (B, 3, N)."""
-        ends = self.measurements.by_frame(points)[..., self.measurements.pairs]
-        return ends[..., 1] - ends[..., 0]
+    def _unknowns_at(self, state: State, columns: Columns = slice(None)) -> _UnknownsAt:
+        m = self.measurements
+        motion = m.motion and m.motion.at(columns)
+        return _UnknownsAt(m.unknowns, m.cameras_at(state), m.pixels_at(state, columns), motion)
 
     def _of_kind(self, kind: type[_Kind]) -> dict[str, _Kind]:
         return {name: loss for name, loss in self.losses.items() if isinstance(loss, kind)}
@@ -190,6 +178,38 @@ class Objective:
         return information.reshape(*shape, 1, -1).expand(*shape, m.frames, m.points_per_frame).flatten(2)
 
 
-def _values(state: State, unknowns: CameraUnknowns) -> Tensor:
-    """A state's values (B, K) of the cameras' further unknowns: those of cameras as given where it has none."""
-    return torch.zeros_like(unknowns.prior_sigma) if state.unknowns is None else state.unknowns
+@dataclass(frozen=True)
+class _UnknownsAt:
+    """The cameras' further unknowns at their present values, as losses look at them."""
+
+    unknowns: RigUnknowns
+    cameras: Intrinsics
+    """as they are at the present values"""
+    pixels: Tensor
+    """keypoints (B, C, 2, n), likewise"""
+    motion: ImageMotion | None
+
+    @property
+    def components(self) -> int:
+        return self.unknowns.components
+
+    @property
+    def if_any(self) -> _UnknownsAt | None:
+        """None where nothing but the poses is unknown."""
+        return self if self.unknowns.count else None
+
+    def columns(self, u: Tensor, v: Tensor, pixel: PixelMap) -> tuple[Tensor, Tensor]:
+        return self.unknowns.columns(u, v, pixel, self.cameras, self.motion)
+
+    def moved(self, deviations: Tensor) -> tuple[Intrinsics, Tensor]:
+        moved = self.at(deviations)
+        return moved.cameras, moved.pixels
+
+    def at(self, deviations: Tensor) -> _UnknownsAt:
+        """The same at deviations (B, C, k) from the present values."""
+        cameras = self.unknowns.applied_by_camera(self.cameras, deviations)
+        pixels = self.pixels
+        if self.motion is not None:
+            delays = self.unknowns.delays_by_camera(self.motion.row, deviations)
+            pixels = pixels - self.motion.velocity * delays.unsqueeze(-2)
+        return _UnknownsAt(self.unknowns, cameras, pixels, self.motion)

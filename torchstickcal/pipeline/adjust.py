@@ -1,306 +1,302 @@
-"""One session's adjustment: initialised, brought through its stages, with lenses and clocks among the unknowns."""
+"""The path that :func:`torchstickcal.calibrate` and :class:`torchstickcal.CalibrationLayer` share.
+
+``begin`` (one session) -> ``adjust_cameras`` -> ``adjust_points`` (B sessions side by side). What follows is each one's own: a
+:class:`torchstickcal.Calibration`, or gradients.
+"""
 
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property
 
 import torch
 from torch import Tensor
 
-from torchstickcal.config import Config, Stage, StickLengthSettings
-from torchstickcal.errors import ObservationError
-from torchstickcal.model.measurements import Measurements, State
-from torchstickcal.model.unknowns import CLOCKS, REFINEMENTS, CameraUnknowns
+from torchstickcal.config import Config, Stage
+from torchstickcal.model.measurements import Measurements
+from torchstickcal.model.state import State
+from torchstickcal.model.unknowns import RigUnknowns, clock_refinements, with_refinements
 from torchstickcal.observations import Observations
-from torchstickcal.pipeline.check import CameraCheck, with_refinements
 from torchstickcal.pipeline.focal_search import search_focal
-from torchstickcal.pipeline.initialise import initialise
-from torchstickcal.pipeline.stage import StageResult, rulers, run_stage
+from torchstickcal.pipeline.initialise import initialise, triangulated
+from torchstickcal.pipeline.scale import rulers
+from torchstickcal.pipeline.stage import StageResult, run_stage
 from torchstickcal.pipeline.synchronise import (
     CLOCK_STAGE,
-    ClockEstimate,
     CommonFrames,
     Exposures,
     Support,
     on_common_frames,
-    on_one_clock,
-    out_of_step,
-    search_offsets,
+    synchronise_keypoints,
 )
-from torchstickcal.solvers import Listener, StageRecord
-from torchstickcal.solvers.uncertainty import camera_covariance
+from torchstickcal.solvers import Listener, StageRecord, unheard
 
-_MAX_STARTS = 3
-_CHECKED_FRAMES = 5000
-_FITTING_SHARE, _FITTING_FOCAL_SHARE = 0.6, 0.01
-"""Least share of the keypoints that agree, and largest noise over the focal length, where the cameras fit together."""
-_FAR_FRAMES = 0.75
-"""Offset from where a camera's frames were placed from which on others are nearer."""
+_INITIALISE = "initialise"
+
+
+@dataclass(frozen=True)
+class Run:
+    """What all steps of a calibration share.
+
+    Args:
+        config: the configuration.
+        listener: hears every iteration.
+        seconds: time by step, which the steps add to.
+    """
+
+    config: Config
+    listener: Listener = unheard
+    seconds: dict[str, float] = field(default_factory=dict)
+
+    @property
+    def camera_stages(self) -> dict[str, Stage]:
+        """The stages up to the last that estimates cameras."""
+        return dict(self._stages[: self._fixed])
+
+    @property
+    def point_stages(self) -> dict[str, Stage]:
+        """The stages after it, in which the cameras are fixed."""
+        return dict(self._stages[self._fixed :])
+
+    def took(self, step: str, seconds: float) -> None:
+        """Add to the time of a step."""
+        self.seconds[step] = self.seconds.get(step, 0.0) + seconds
+
+    @property
+    def _stages(self) -> list[tuple[str, Stage]]:
+        return list(self.config.stages.items())
+
+    @property
+    def _fixed(self) -> int:
+        """Number of stages up to the last that estimates cameras; all where none does."""
+        free = [number for number, (_, stage) in enumerate(self._stages) if stage.cameras == "free"]
+        return max(free, default=len(self._stages) - 1) + 1
 
 
 @dataclass(frozen=True)
 class Adjustment:
-    """A session with its cameras adjusted."""
+    """B sessions on their way: what was measured, and what has been estimated so far."""
 
-    frames: CommonFrames
-    seen: Measurements
-    """the keypoints as seen, on the common frames, with the unknowns"""
-    measurements: Measurements
-    """the same, brought to the common clock"""
+    observations: tuple[Observations, ...]
+    frames: tuple[CommonFrames, ...]
     refined: tuple[str, ...]
-    """what is found of the cameras beside their poses"""
-    result: StageResult
-    records: tuple[StageRecord, ...]
+    """what is estimated of the cameras beside their poses, of :data:`torchstickcal.model.unknowns.REFINEMENTS`"""
+    seen: Measurements
+    """the keypoints as detected, on the common frames"""
+    measurements: Measurements
+    """the same keypoints, moved in the image to where they would be at the times of the common frames"""
+    state: State
+    results: tuple[StageResult, ...] = ()
+    """of the last stage that estimated cameras, and of those after it"""
+    records: tuple[tuple[StageRecord, ...], ...] = ((),)
+    """of every stage, for each session"""
     window: slice = field(default_factory=lambda: slice(None))
     """which of the common frames this is about"""
 
+    @staticmethod
+    def stack(sessions: Sequence[Adjustment]) -> Adjustment:
+        """Sessions of equal shape that have just begun, as one batch."""
+        return Adjustment(
+            tuple(session.observations[0] for session in sessions),
+            tuple(session.frames[0] for session in sessions),
+            sessions[0].refined,
+            Measurements.stack([session.seen for session in sessions]),
+            Measurements.stack([session.measurements for session in sessions]),
+            State.stack([session.state for session in sessions]),
+            records=((),) * len(sessions),
+        )
+
+    @property
+    def exposures(self) -> Exposures:
+        """When the keypoints were exposed."""
+        return Exposures.stack([Exposures.of(frames, self.window) for frames in self.frames])
+
+    @property
+    def cameras(self) -> StageResult:
+        """Where the last stage that estimated cameras ended."""
+        return self.results[0]
+
+    @property
+    def last(self) -> StageResult:
+        """Where the last stage ended."""
+        return self.results[-1]
+
+    @property
+    def support(self) -> Support:
+        """How well the points are known where the last stage ended."""
+        return Support.of(self.kept, self.state, self.last.sigma_px)
+
+    @property
+    def kept(self) -> Measurements:
+        """The measurements that took part to the end."""
+        return self.measurements.keeping(self.last.inliers)
+
+    @property
+    def asynchronous(self) -> bool:
+        """Whether keypoints of one common frame were, or may have been, exposed at different times."""
+        return any(frames.apart for frames in self.frames) or self.seen.unknowns.clocked
+
+    @property
+    def converged(self) -> bool:
+        """Whether every stage converged, in all sessions."""
+        return all(record.stop.converged for records in self.records for record in records)
+
+    def status(self, session: int) -> str:
+        """``converged``, or which stages of a session did not and why."""
+        failed = [f"{record.name}: {record.stop}" for record in self.records[session] if not record.stop.converged]
+        return "; ".join(failed) or "converged"
+
+    @property
+    def remaining_offsets_frames(self) -> Tensor:
+        """(C,), time offsets of one session's cameras beyond those by which their frames were chosen, as found, in frames."""
+        found = self.seen.unknowns.by_name(self.state.unknowns).get("time_offset")
+        return torch.zeros_like(self.frames[0].offsets_frames) if found is None else found[0, :, 0]
+
+    def ended(self, result: StageResult) -> Adjustment:
+        """After one more stage."""
+        records = tuple((*before, record) for before, record in zip(self.records, result.records, strict=True))
+        earlier = self.results if result.stage.cameras == "held" and self.results else ()
+        return replace(self, state=result.state, results=(*earlier, result), records=records)
+
     def within(self, most_frames: int) -> Adjustment:
-        """Cut down to the middle of a session that is longer."""
+        """The middle of sessions that are longer."""
         total = self.measurements.frames
         if total <= most_frames:
             return self
         start = (total - most_frames) // 2
         window = slice(start, start + most_frames)
-        columns, result = self.measurements.columns_of(window), self.result
-        state = replace(result.state, points=result.state.points[..., columns])
+        columns = self.measurements.columns_of(window)
+
+        def cut(state: State) -> State:
+            return replace(state, points=state.points[..., columns])
+
         return replace(
             self,
             seen=self.seen.within(window),
             measurements=self.measurements.within(window),
-            result=result._replace(state=state, inliers=result.inliers[..., columns]),
+            state=cut(self.state),
+            results=tuple(
+                r._replace(state=cut(r.state), minimum=cut(r.minimum), inliers=r.inliers[..., columns]) for r in self.results
+            ),
             window=window,
         )
 
-    @property
-    def exposures(self) -> Exposures:
-        """When the keypoints were exposed, as far as told."""
-        return Exposures.of(self.frames, self.window)
 
-    @property
-    def apart(self) -> bool:
-        """Whether keypoints at one common frame were not, or need not have been, exposed together."""
-        return self.frames.apart or bool(CLOCKS & set(self.refined))
+@dataclass(frozen=True)
+class WarmStart:
+    """An earlier estimate of one session to start from."""
 
-    @property
-    def kept(self) -> Measurements:
-        """The measurements that took part to the end."""
-        return self.measurements.keeping(self.result.inliers)
-
-    @property
-    def converged(self) -> bool:
-        """Whether every stage did."""
-        return all(record.stop.converged for record in self.records)
-
-    @property
-    def fits(self) -> bool:
-        """Whether the cameras agree as those of one scene do, with detectors of any use."""
-        share = self.result.inliers.sum() / self.measurements.visible.sum()
-        noise = self.result.sigma_px.median() / self.measurements.cameras.focal_px.mean()
-        return self.converged and float(share) > _FITTING_SHARE and float(noise) < _FITTING_FOCAL_SHARE
-
-    @property
-    def median_residual(self) -> float:
-        """Median squared residual of all keypoints, square pixels."""
-        return float(self.measurements.squared_residuals(self.result.state)[self.measurements.visible].median())
-
-    @property
-    def late_frames(self) -> Tensor:
-        """(C,), how much later than at :attr:`frames` the cameras were found to look, frames."""
-        nothing = torch.zeros_like(self.frames.offsets_frames)
-        return self.found.get("time_offset", nothing)
-
-    @property
-    def found(self) -> dict[str, Tensor]:
-        """Each camera's value (C,) of what else was unknown of it, by kind."""
-        unknowns, values = self.measurements.unknowns, self.result.state.unknowns
-        if unknowns is None or values is None:
-            return {}
-        return {name: own[0] for name, own in unknowns.by_kind(values).items()}
-
-    def covariance(self, sigma_px: Tensor) -> Tensor | None:
-        """That of the cameras where they were adjusted, for a noise (1, P) of the points' keypoints."""
-        if not self.result.cameras_free:
-            return None
-        return camera_covariance(self.kept, self.result.state, sigma_px, self.sigma_length_m)
-
-    @property
-    def sigma_length_m(self) -> Tensor | float:
-        """How well the sticks' lengths hold."""
-        length = self.result.losses.get("stick_length")
-        return length.sigma if length is not None and length.weight == 1.0 else StickLengthSettings().sigma_m
+    rotations: Tensor
+    """(C, 3, 3), world to camera"""
+    translations: Tensor
+    """(C, 3), metres"""
+    points: Tensor
+    """(F, P, 3), metres, NaN where not known"""
+    unknowns: Tensor
+    """(K,), of the cameras"""
+    inliers: Tensor
+    """(C, F, P)"""
+    sigma_px: Tensor
+    """(P,)"""
 
 
-class Adjuster:
-    """Adjusts one session in different ways: at other clock offsets, with other unknowns.
+def begin(
+    observations: Observations,
+    run: Run,
+    refined: Sequence[str] = (),
+    offsets_frames: Tensor | None = None,
+    start: WarmStart | None = None,
+) -> Adjustment:
+    """One session with the first estimate of its rig and points.
 
     Args:
         observations: the session.
-        settings: the configuration.
-        listener: hears every iteration.
+        run: what all steps share.
+        refined: what is to be estimated of the cameras beside their poses.
+        offsets_frames: (C,), time offsets of the cameras' frames, in frames; None for those given.
+        start: an earlier estimate; None to estimate the rig from nothing.
 
     Raises:
-        ConfigError: if nothing sets the scale.
-        ObservationError: if clocks are to be found without what they are counted in.
+        ConfigError: if there are camera groups, but not a label for each camera.
+        ObservationError: if no two cameras have a frame in common.
+        RigError: if the cameras cannot be placed in one rig.
     """
+    began = time.perf_counter()
+    config, frames = run.config, on_common_frames(observations, offsets_frames)
+    seen = measured(frames, config)
+    if start is not None:
+        state = _state_of(start, seen, config)
+    elif observations.intrinsics_known:
+        state = initialise(seen, config.initialise, observations.camera_labels)
+    else:
+        seen, state = search_focal(seen, observations, config)
+        refined = refined if "focal" in refined else with_refinements(refined, ("focal_shared",))
+    seen = replace(seen, unknowns=RigUnknowns.of(refined, seen.cameras, config.camera_groups))
+    if start is None:
+        state = replace(state, unknowns=seen.unknowns.given)
+    begun = Adjustment((observations,), (frames,), tuple(refined), seen, seen, state)
+    if seen.unknowns.clocked:
+        begun = replace(begun, measurements=begun.exposures.unmoved(seen))
+        if start is not None:
+            known = begun.measurements.keeping(start.inliers.flatten(1)[None])
+            support = Support.of(known, state, start.sigma_px[None].double())
+            begun = replace(begun, measurements=begun.exposures.on_common_frames(seen, state, support))
+    run.took(_INITIALISE, time.perf_counter() - began)
+    return begun
 
-    def __init__(self, observations: Observations, settings: Config, listener: Listener) -> None:
-        self._observations, self._settings, self._listener = observations, settings, listener
-        self._known = rulers([observations], settings)
-        self._adjusting, self._holding = _split(settings.stages)
-        self.seconds: dict[str, float] = {}
-        """time by step"""
-        impossible = set() if settings.refine == "auto" else set(settings.refine) - self.refinable
-        if impossible:
-            raise ObservationError(
-                "clocks without what they are counted in",
-                where="refine",
-                got=", ".join(sorted(impossible)),
-                expected="fps or timestamps, and for readout the image size",
-            )
 
-    @property
-    def refinable(self) -> set[str]:
-        """What the session allows to refine: clocks are counted in frames a second, a shutter in rows of the image."""
-        given = self._observations
-        names = set(REFINEMENTS) - CLOCKS
-        if given.fps is not None or given.timestamps is not None:
-            names |= CLOCKS if given.image_size is not None else {"time_offset"}
-        return names
+def adjust_cameras(adjustment: Adjustment, run: Run, only_last: bool = False) -> Adjustment:
+    """The stages up to the last that estimates cameras, and clocks until they agree with the points' motion.
 
-    def search(self) -> ClockEstimate:
-        """The clocks' offsets by the motion in the images."""
-        return search_offsets(*self._as_told())
+    Args:
+        adjustment: sessions that have begun.
+        run: what all steps share.
+        only_last: whether the state is near enough to begin with the last of these stages.
+    """
+    stages = list(run.camera_stages.items())
+    return _synchronised(_through(stages[-1:] if only_last else stages, adjustment, run), run)
 
-    @cached_property
-    def out_of_step(self) -> bool:
-        """Whether the cameras' frames clearly do not belong together as told, by the motion in the images."""
-        return "time_offset" in self.refinable and out_of_step(*self._as_told())
 
-    def _as_told(self) -> tuple[Measurements, float]:
-        """The keypoints on the clocks as told, and the largest offset that is looked for, frames."""
-        frames = on_common_frames(self._observations)
-        assert frames.rate_hz is not None
-        return self._seen(frames), self._settings.max_offset_s * frames.rate_hz
+def adjust_again(adjustment: Adjustment, run: Run, refined: Sequence[str]) -> Adjustment:
+    """Sessions from where they have ended, with more to be estimated of their cameras.
 
-    def _seen(self, frames: CommonFrames) -> Measurements:
-        """The keypoints that may take part."""
-        precision = torch.float32 if self._settings.precision == "float32" else torch.float64
-        return Measurements.of(frames.observations, points_used(self._observations, self._settings), precision)
+    Where that is clocks alone, the last stage is run again with them; otherwise all stages are.
 
-    def begin(self, refined: Sequence[str], offsets_frames: Tensor | None = None) -> Adjustment:
-        """Adjust from nothing.
+    Args:
+        adjustment: where the sessions have ended.
+        run: what all steps share.
+        refined: what is to be estimated of the cameras beside their poses.
+    """
+    seen = replace(adjustment.seen, unknowns=RigUnknowns.of(refined, adjustment.seen.cameras, run.config.camera_groups))
+    values = seen.unknowns.taken_over(adjustment.seen.unknowns, adjustment.state.unknowns)
+    state = replace(adjustment.state, unknowns=values)
+    measurements = seen
+    if seen.unknowns.clocked and not adjustment.asynchronous:
+        measurements = adjustment.exposures.unmoved(seen)
+    if adjustment.asynchronous:
+        measurements = adjustment.exposures.on_common_frames(seen, state, adjustment.support)
+    again = replace(adjustment, refined=tuple(refined), seen=seen, measurements=measurements, state=state)
+    if set(refined) - set(adjustment.refined) <= clock_refinements():
+        result = again.last._replace(state=state, minimum=replace(again.last.minimum, unknowns=values))
+        return _synchronised(replace(again, results=(result,)), run)
+    return adjust_cameras(replace(again, results=(), records=((),) * seen.sessions), run)
 
-        Args:
-            refined: what to find of the cameras beside their poses.
-            offsets_frames: (C,), how much later than reckoned the cameras' frames begin; None for not at all.
 
-        Raises:
-            RigError: if the cameras cannot be placed in one rig.
-        """
-        return self._nearer(self._begin(refined, offsets_frames))
+def adjust_points(adjustment: Adjustment, run: Run) -> Adjustment:
+    """The stages in which the cameras are fixed."""
+    return _through(run.point_stages.items(), adjustment, run)
 
-    def _begin(self, refined: Sequence[str], offsets_frames: Tensor | None) -> Adjustment:
-        """Initialised with the cameras' frames side by side at some offsets, and adjusted."""
-        began = time.perf_counter()
-        frames = on_common_frames(self._observations, offsets_frames)
-        seen, given = self._seen(frames), self._observations
-        labels = [given.camera_label(index) for index in range(given.num_cameras)]
-        if given.intrinsics_known:
-            state = initialise(seen, self._settings.initialise, labels)
-        else:
-            seen, state = search_focal(seen, self._settings, labels, self._known)
-            refined = refined if "focal" in refined else with_refinements(refined, ("focal_shared",))
-        self._took("initialise", time.perf_counter() - began)
-        seen = self._refining(seen, refined)
-        measurements, records = _resting(frames, seen), []
-        result = self._through(self._adjusting, measurements, _starting(seen, state), records)
-        return self._on_one_clock(Adjustment(frames, seen, measurements, tuple(refined), result, tuple(records)))
 
-    def again(self, adjustment: Adjustment, refined: Sequence[str]) -> Adjustment:
-        """Adjust again from where an adjustment ended, with more refined; where that is clocks alone, the last stage does."""
-        seen, old = self._refining(adjustment.seen, refined), adjustment.result.state
-        state = _starting(seen, old, adjustment.seen.unknowns)
-        result = adjustment.result._replace(state=state)
-        measurements = _placed(adjustment, seen, state) if adjustment.apart else _resting(adjustment.frames, seen)
-        records = list(adjustment.records)
-        if set(refined) - set(adjustment.refined) - CLOCKS:
-            records = []
-            result = self._through(self._adjusting, measurements, state, records)
-        started = replace(adjustment, seen=seen, measurements=measurements, refined=tuple(refined))
-        return self._nearer(self._on_one_clock(replace(started, result=result, records=tuple(records))))
-
-    def _nearer(self, adjustment: Adjustment) -> Adjustment:
-        """Begun again with the cameras' frames at the common frames nearest to them, if these are others than was thought."""
-        for _ in range(_MAX_STARTS - 1):
-            if not bool((adjustment.late_frames.abs() > _FAR_FRAMES).any()):
-                break
-            adjustment = self._begin(adjustment.refined, adjustment.frames.offsets_frames + adjustment.late_frames)
-        return adjustment
-
-    def held(self, adjustment: Adjustment) -> Adjustment:
-        """The stages that follow once the cameras are found."""
-        if not self._holding:
-            return adjustment
-        records = list(adjustment.records)
-        result = self._through(self._holding, adjustment.measurements, adjustment.result.state, records)
-        return replace(adjustment, result=result, records=tuple(records))
-
-    def check(self, adjustment: Adjustment) -> CameraCheck:
-        """What the data say of lenses and clocks where an adjustment ended; of a long session some of the data."""
-        part = adjustment.within(_CHECKED_FRAMES)
-        result = part.result
-        kept = _placed(part, part.seen, result.state).keeping(result.inliers)
-        return CameraCheck(kept, result.state, result.sigma_px, adjustment.sigma_length_m, self._settings.camera_groups)
-
-    def _on_one_clock(self, adjustment: Adjustment) -> Adjustment:
-        """Where keypoints were not exposed together, the last stage on the common clock."""
-        if not adjustment.apart:
-            return adjustment
-        last, records = list(self._adjusting.values())[-1], list(adjustment.records)
-
-        def run(placed: Measurements, state: State) -> StageResult:
-            return self._run(CLOCK_STAGE, last, placed, state, records)
-
-        ended = adjustment.measurements, adjustment.result
-        placed, result = on_one_clock(adjustment.seen, adjustment.exposures, *ended, run)
-        return replace(adjustment, measurements=placed, result=result, records=tuple(records))
-
-    def _through(
-        self, stages: Mapping[str, Stage], measurements: Measurements, state: State, records: list[StageRecord]
-    ) -> StageResult:
-        result: StageResult | None = None
-        for name, stage in stages.items():
-            result = self._run(name, stage, measurements, state, records)
-            state = result.state
-        assert result is not None
-        return result
-
-    def _run(
-        self, name: str, stage: Stage, measurements: Measurements, state: State, records: list[StageRecord]
-    ) -> StageResult:
-        result = run_stage(name, stage, measurements, state, self._known, self._settings.solver, self._listener)
-        records.extend(result.records)
-        self._took(name, records[-1].seconds)
-        return result
-
-    def _took(self, step: str, seconds: float) -> None:
-        self.seconds[step] = self.seconds.get(step, 0.0) + seconds
-
-    def _refining(self, seen: Measurements, names: Sequence[str]) -> Measurements:
-        """Measurements with some of :data:`torchstickcal.model.unknowns.REFINEMENTS` among the unknowns.
-
-        Raises:
-            ConfigError: if there are camera groups, but not a label for each camera.
-        """
-        return replace(seen, unknowns=CameraUnknowns.of(names, seen.cameras, self._settings.camera_groups) if names else None)
+def measured(frames: CommonFrames, config: Config) -> Measurements:
+    """The keypoints that take part, as detected."""
+    precision = torch.float32 if config.precision == "float32" else torch.float64
+    return Measurements.of(frames.observations, points_used(frames.observations, config), precision)
 
 
 def points_used(observations: Observations, config: Config) -> list[int] | None:
     """The points that take part; None for all."""
-    ends = {end for stick in observations.sticks for end in (stick.start, stick.end)}
+    ends = {end for stick in observations.sticks for end in stick.ends}
     if config.points == "sticks":
         return sorted(ends)
     if config.points == "joints":
@@ -308,29 +304,41 @@ def points_used(observations: Observations, config: Config) -> list[int] | None:
     return None
 
 
-def _split(stages: Mapping[str, Stage]) -> tuple[dict[str, Stage], dict[str, Stage]]:
-    """The stages up to the last that adjusts the cameras, and those after it."""
-    names = list(stages)
-    last = max((number for number, name in enumerate(names) if stages[name].cameras == "free"), default=len(names) - 1)
-    return {name: stages[name] for name in names[: last + 1]}, {name: stages[name] for name in names[last + 1 :]}
+def _through(stages: Iterable[tuple[str, Stage]], adjustment: Adjustment, run: Run) -> Adjustment:
+    for name, stage in stages:
+        adjustment = adjustment.ended(_run_stage(name, stage, adjustment, run))
+    return adjustment
 
 
-def _starting(seen: Measurements, state: State, before: CameraUnknowns | None = None) -> State:
-    """A state for the measurements' unknowns: those it has, of the unknowns before, and else what was given."""
-    if seen.unknowns is None:
-        return replace(state, unknowns=None)
-    nothing = torch.zeros_like(seen.unknowns.prior_sigma)
-    if before is None or state.unknowns is None:
-        return replace(state, unknowns=nothing)
-    return replace(state, unknowns=seen.unknowns.taken_over(before, state.unknowns))
+def _synchronised(adjustment: Adjustment, run: Run) -> Adjustment:
+    """Where keypoints were not all exposed together: the last stage again and again, until clocks and motion agree."""
+    if not adjustment.asynchronous:
+        return adjustment
+    *_, stage = run.camera_stages.values()
+
+    def again(measurements: Measurements, state: State) -> StageResult:
+        return _run_stage(CLOCK_STAGE, stage, replace(adjustment, measurements=measurements, state=state), run)
+
+    before = adjustment.measurements, adjustment.last
+    measurements, result, records = synchronise_keypoints(adjustment.seen, adjustment.exposures, *before, again)
+    together = tuple((*earlier, *own) for earlier, own in zip(adjustment.records, records, strict=True))
+    return replace(adjustment, measurements=measurements, state=result.state, results=(result,), records=together)
 
 
-def _resting(frames: CommonFrames, seen: Measurements) -> Measurements:
-    """Keypoints as seen, as if nothing moved, where clocks are among the unknowns."""
-    return Exposures.of(frames).resting(seen) if seen.unknowns is not None and seen.unknowns.clocked else seen
+def _run_stage(name: str, stage: Stage, adjustment: Adjustment, run: Run) -> StageResult:
+    known = rulers(adjustment.observations, run.config)
+    measurements, state, observations = adjustment.measurements, adjustment.state, adjustment.observations[0]
+    result = run_stage(name, stage, measurements, state, observations, known, run.config.solver, run.listener)
+    run.took(name, result.records[0].seconds)
+    return result
 
 
-def _placed(adjustment: Adjustment, seen: Measurements, state: State) -> Measurements:
-    """Keypoints as seen, brought to the common clock at a state by the motion that an adjustment has found."""
-    result = adjustment.result
-    return adjustment.exposures.placed(seen, state, Support.of(adjustment.kept, result.state, result.sigma_px))
+def _state_of(start: WarmStart, seen: Measurements, config: Config) -> State:
+    """An earlier estimate as a state; points that it does not have are triangulated."""
+    rotations, translations, unknowns = (v[None].double() for v in (start.rotations, start.translations, start.unknowns))
+    points = start.points.double().flatten(0, 1).mT[None]
+    known = points.isfinite().all(1)
+    points = points.nan_to_num()
+    if bool((seen.active & ~known).any()):
+        points = points.where(known[:, None], triangulated(seen, rotations, translations, config.initialise))
+    return State(rotations, translations, points.contiguous(), unknowns)

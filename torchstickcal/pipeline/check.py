@@ -1,119 +1,89 @@
-"""Do lenses and clocks as given agree with the data? What they would be if they were unknown, from one linearisation.
+"""Do the given lenses and clocks agree with the keypoints? What they would be if they were unknown, from one linearisation.
 
-At the solution the reduced camera system is built with a column for every parameter of every camera. Any choice of parameters,
-own or shared, is then a small system in which the others are held, and the decrease of the cost that it promises says how much
-the data want it.
+At the solution the reduced camera system is built with a column for every unknown of every camera. Any choice of unknowns, own
+or shared, is then a small system in which the other columns are left out. The decrease of the cost that it promises says how
+strongly the keypoints ask for this choice.
 """
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+import itertools
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
-from torchstickcal.model.measurements import Measurements, State
+from torchstickcal.model.measurements import Measurements
 from torchstickcal.model.noise import residual_correlation
-from torchstickcal.model.unknowns import REFINEMENTS, CameraUnknowns
+from torchstickcal.model.state import State
+from torchstickcal.model.unknowns import RigUnknowns, all_unknowns, with_refinements
+from torchstickcal.pipeline.adjust import Adjustment
 from torchstickcal.solvers.elimination.normal_equations import NormalEquations
-from torchstickcal.solvers.uncertainty import normal_objective
+from torchstickcal.solvers.uncertainty import likelihood
 
-_EVERY = ("focal", "principal_point", "radial", "time_offset", "readout")
-_CHOICES = (
-    ("time_offset",),
-    ("readout",),
-    ("time_offset", "readout"),
-    ("focal_shared",),
-    ("focal",),
-    ("radial",),
-    ("principal_point",),
-    ("focal_shared", "radial"),
-    ("focal", "radial"),
-    ("focal_shared", "principal_point"),
-    ("focal", "principal_point"),
-    ("focal_shared", "principal_point", "radial"),
-    ("focal", "principal_point", "radial"),
-)
+_CHECKED_FRAMES = 5000
 _SIGMAS = 4.0
 _LEAST_EVIDENCE = 1e-6
 _PRICE = 4.0
-"""What a further parameter has to lower the cost by, a standard deviation's being 1: chance gives 1 each."""
+"""Decrease of the cost that each further unknown has to bring, in units of a squared standard deviation; chance brings 1."""
 
 
-class FocalCheck(NamedTuple):
-    """Each camera's focal length as the data have it, all else of the lenses being as it is."""
+class Suggestion(NamedTuple):
+    """What an unknown would be by the keypoints, as a deviation from the present value, everything else being as it is."""
 
-    ratio: Tensor
-    """(C,), over the one in use"""
+    deviation: Tensor
+    """(C, n)"""
     std: Tensor
-    """(C,), of the ratio"""
-
-
-class ClockCheck(NamedTuple):
-    """When each camera looks as the data have it, all else being as it is."""
-
-    late_frames: Tensor
-    """(C,), how much later than reckoned with, against the first camera"""
-    std: Tensor
-    """(C,), zero for the first camera"""
+    """(C, n)"""
 
 
 class CameraCheck:
-    """One session's cameras at a solution, looked at as if their lenses and clocks were unknown.
+    """One session's cameras at a solution, examined as if their lenses and clocks were unknown.
 
     Args:
-        measurements: those that took part, with their motion.
-        state: the solution.
-        sigma_px: noise of each point's keypoints, (1, P).
-        sigma_length_m: how well the sticks' lengths hold.
-        groups: a label for each camera; those with the same share what is shared.
+        adjustment: one session where it has ended. Of a long one the middle is examined.
+        groups: a label for each camera; cameras with the same label share what is shared.
     """
 
-    def __init__(
-        self, measurements: Measurements, state: State, sigma_px: Tensor, sigma_length_m: float | Tensor, groups: Sequence[str]
-    ) -> None:
-        in_use, motion = measurements.cameras_at(state).to(torch.float64), measurements.motion
-        assert motion is not None
-        self._cameras, self._groups = in_use, groups
-        self._every = CameraUnknowns.of(_EVERY, in_use)
-        looked_at = replace(
-            measurements,
-            pixels=measurements.pixels_at(state),
-            cameras=in_use,
-            unknowns=self._every,
-            motion=motion._replace(reckoned=torch.zeros_like(self._every.prior_sigma)),
-        )
-        objective = normal_objective(looked_at, sigma_px, sigma_length_m)
-        system = NormalEquations(objective, replace(state, unknowns=None), cameras_free=True)
+    def __init__(self, adjustment: Adjustment, groups: Sequence[str]) -> None:
+        part = adjustment.within(_CHECKED_FRAMES)
+        result, state = part.last, part.state
+        support = part.support
+        kept = part.exposures.on_common_frames(part.seen, state, support).keeping(result.inliers)
+        cameras = kept.cameras_at(state).to(torch.float64)
+        self._cameras, self._groups = cameras, groups
+        self._variants = {unknown.name: next(iter(unknown.variants)) for unknown in all_unknowns().values()}
+        self._every = RigUnknowns.of(tuple(self._variants.values()), cameras, groups)
+        examined = _with_every_unknown(kept, state, self._every)
+        objective = likelihood(examined, part.cameras.losses, result.sigma_px)
+        system = NormalEquations(objective, replace(state, unknowns=self._every.given), cameras_free=True)
         self._information, self._gradient = system.reduced[0], system.reduced_gradient[0]
-        correlation = residual_correlation(measurements, state, sigma_px)
+        correlation = residual_correlation(kept, state, result.sigma_px)
         self._evidence = (1 - correlation) / (1 + correlation)
 
-    def focal(self) -> FocalCheck:
-        """The focal lengths, each camera's on its own."""
-        values, covariance = self._solved(("focal",))
-        return FocalCheck(values.exp(), covariance.diagonal().sqrt())
-
-    def clocks(self) -> ClockCheck:
-        """The clocks, each camera's on its own but the first's."""
-        values, covariance = self._solved(("time_offset",))
-        late, std = (torch.nn.functional.pad(own, (1, 0)) for own in (values, covariance.diagonal().sqrt()))
-        return ClockCheck(late, std)
+    def suggestions(self) -> dict[str, Suggestion]:
+        """What the keypoints suggest for each unknown by itself, by its name."""
+        found: dict[str, Suggestion] = {}
+        for name, variant in self._variants.items():
+            unknowns, values, covariance = self._solved((variant,))
+            deviation, variance = unknowns.by_name(values[None])[name][0], unknowns.variances(covariance)[name]
+            found[name] = Suggestion(deviation, variance.sqrt())
+        return found
 
     def wanted(
         self, allowed: Collection[str], refined: Sequence[str] = (), failed: Sequence[tuple[str, ...]] = ()
     ) -> tuple[str, ...]:
-        """The refinements that the data call for beside those made; none where the cameras in use agree with the data.
+        """The refinements that the keypoints ask for most beside those made; none where the cameras agree with the keypoints.
 
         Args:
             allowed: what may be refined.
             refined: the refinements made.
-            failed: choices that have been tried in vain.
+            failed: choices that were tried and did not converge.
         """
         best, choice = _SIGMAS**2, ()
-        for names in _CHOICES:
+        for names in _choices():
             if names in failed or not set(names) <= set(allowed) or with_refinements(refined, names) == tuple(refined):
                 continue
             gain = self._gain(names)
@@ -122,42 +92,58 @@ class CameraCheck:
         return choice
 
     def _gain(self, names: tuple[str, ...]) -> float:
-        """Decrease of the cost that a choice promises, less a price for each of its parameters.
+        """Decrease of the cost that a choice promises, less a price for each of its unknowns.
 
-        Residuals that are alike from frame to frame count as the fewer independent ones that they are worth.
+        Residuals that are alike from frame to frame count as the smaller number of independent ones that they are worth.
         """
         promised = self._evidence * (self._decrease(names) - self._decrease(()))
-        return promised - _PRICE * CameraUnknowns.of(names, self._cameras).count
+        return promised - _PRICE * RigUnknowns.of(names, self._cameras, self._groups).count
 
     def _decrease(self, names: tuple[str, ...]) -> float:
-        chosen = self._chosen(names)
+        chosen, _ = self._chosen(names)
         gradient = chosen.mT @ self._gradient
         return float(gradient @ torch.linalg.solve(chosen.mT @ self._information @ chosen, gradient))
 
-    def _solved(self, names: tuple[str, ...]) -> tuple[Tensor, Tensor]:
-        """Values and covariance of a choice's parameters."""
-        chosen = self._chosen(names)
+    def _solved(self, names: tuple[str, ...]) -> tuple[RigUnknowns, Tensor, Tensor]:
+        """A choice's unknowns, their values and their covariance."""
+        chosen, unknowns = self._chosen(names)
         covariance = torch.linalg.inv(chosen.mT @ self._information @ chosen)
-        cameras = len(self._gradient) - self._every.count
-        values = -(covariance @ (chosen.mT @ self._gradient))[cameras:]
-        return values, covariance[cameras:, cameras:] / max(self._evidence, _LEAST_EVIDENCE)
+        poses = len(self._gradient) - self._every.count
+        values = -(covariance @ (chosen.mT @ self._gradient))[poses:]
+        return unknowns, values, covariance[poses:, poses:] / max(self._evidence, _LEAST_EVIDENCE)
 
-    def _chosen(self, names: tuple[str, ...]) -> Tensor:
-        """The map from poses and a choice's parameters to poses and all parameters."""
-        cameras = len(self._gradient) - self._every.count
-        poses = torch.eye(cameras).to(self._gradient)
-        if not names:
-            return torch.nn.functional.pad(poses, (0, 0, 0, self._every.count))
-        unknowns = CameraUnknowns.of(names, self._cameras, self._groups or None)
-        of_all = [kind.name for kind in self._every.kinds]
-        picked = unknowns.share.new_zeros(unknowns.share.shape[0], len(of_all), unknowns.count)
-        picked[:, [of_all.index(kind.name) for kind in unknowns.kinds]] = unknowns.share
-        return torch.block_diag(poses, torch.einsum("cki,ckj->ij", self._every.share, picked))
+    def _chosen(self, names: tuple[str, ...]) -> tuple[Tensor, RigUnknowns]:
+        """The map from poses and a choice's unknowns to poses and all unknowns, and the choice's unknowns."""
+        unknowns = RigUnknowns.of(names, self._cameras, self._groups)
+        poses = torch.eye(len(self._gradient) - self._every.count).to(self._gradient)
+        every = [(unknown.name, component) for unknown in self._every.unknowns for component in unknown.components]
+        chosen = [(unknown.name, component) for unknown in unknowns.unknowns for component in unknown.components]
+        picked = unknowns.share.new_zeros(len(unknowns.share), len(every), unknowns.count)
+        picked[:, [every.index(component) for component in chosen]] = unknowns.share
+        means = self._every.share / self._every.share.sum((0, 1))
+        return torch.block_diag(poses, torch.einsum("cki,ckj->ij", means, picked)), unknowns
 
 
-def with_refinements(names: Sequence[str], contradicted: Sequence[str]) -> tuple[str, ...]:
-    """Refinements made so far with others added: a focal length of its own takes the place of a shared one."""
-    together = {*names, *contradicted}
-    if "focal" in together:
-        together.discard("focal_shared")
-    return tuple(name for name in REFINEMENTS if name in together)
+def _with_every_unknown(kept: Measurements, state: State, every: RigUnknowns) -> Measurements:
+    """Measurements with more unknowns, which are zero where the cameras are as a state has them."""
+    assert kept.motion is not None
+    return replace(
+        kept,
+        pixels=kept.pixels_at(state),
+        cameras=kept.cameras_at(state).to(torch.float64),
+        unknowns=every,
+        motion=kept.motion._replace(reference=every.given),
+    )
+
+
+def _choices() -> Iterator[tuple[str, ...]]:
+    """What ``auto`` compares: every combination of the unknowns of one family, each in any of its variants."""
+    for family in ("clock", "lens"):
+        variants = [
+            [None, *unknown.variants]
+            for unknown in all_unknowns().values()
+            if unknown.family == family and unknown.tried_by_auto
+        ]
+        for names in itertools.product(*variants):
+            if any(names):
+                yield tuple(name for name in names if name is not None)

@@ -1,8 +1,7 @@
-"""Where no focal length is given: the one that lets the views agree, of a range of them, in a short adjustment each."""
+"""Where no focal length is given: of a range of focal lengths, the one with which the views agree best."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import replace
 
 import torch
@@ -11,19 +10,20 @@ from torch import Tensor
 from torchstickcal.config import Config
 from torchstickcal.errors import RigError
 from torchstickcal.geometry.cameras import Intrinsics
-from torchstickcal.model.measurements import Measurements, State
-from torchstickcal.model.unknowns import CameraUnknowns
+from torchstickcal.model.measurements import Measurements
+from torchstickcal.model.state import State
+from torchstickcal.model.unknowns import RigUnknowns
+from torchstickcal.observations import Observations
 from torchstickcal.pipeline.initialise import initialise
-from torchstickcal.pipeline.stage import Ruler, run_stage
+from torchstickcal.pipeline.scale import rulers
+from torchstickcal.pipeline.stage import run_stage
 from torchstickcal.solvers import unheard
 
 _RATIOS = (0.45, 0.55, 0.67, 0.82, 1.0, 1.22, 1.5, 1.83, 2.2)
 """Focal lengths tried, over the guessed ones."""
 
 
-def search_focal(
-    measurements: Measurements, settings: Config, labels: Sequence[str], known: Sequence[Ruler]
-) -> tuple[Measurements, State]:
+def search_focal(measurements: Measurements, observations: Observations, config: Config) -> tuple[Measurements, State]:
     """Cameras near their focal lengths, and a first estimate of rig and points.
 
     From each of the ratios the first stage adjusts rig, points and a focal length common to each camera group; the median
@@ -31,31 +31,32 @@ def search_focal(
 
     Args:
         measurements: one session, with guessed cameras.
-        settings: the configuration.
-        labels: the cameras' names.
-        known: where the scale comes from.
+        observations: the same as the user gave it.
+        config: the configuration.
 
     Raises:
         RigError: if no focal length lets the cameras be placed in one rig.
     """
-    name, stage = next(iter(settings.stages.items()))
+    name, stage = next(iter(config.stages.items()))
     best = torch.inf
     found: tuple[Measurements, State] | None = None
     failure: RigError | None = None
     for ratio in _RATIOS:
         trial = replace(measurements, cameras=_scaled(measurements.cameras, ratio))
-        trial = replace(trial, unknowns=CameraUnknowns.of(("focal_shared",), trial.cameras, settings.camera_groups))
+        trial = replace(trial, unknowns=RigUnknowns.of(("focal_shared",), trial.cameras, config.camera_groups))
         try:
-            start = initialise(trial, settings.initialise, labels)
+            start = initialise(trial, config.initialise, observations.camera_labels)
         except RigError as error:
             failure = error
             continue
-        state = run_stage(name, stage, trial, start, known, settings.solver, unheard).state
+        start = replace(start, unknowns=trial.unknowns.given)
+        known = rulers([observations], config)
+        state = run_stage(name, stage, trial, start, observations, known, config.solver, unheard).state
         residual = _median_residual(trial, state)
         if residual < best:
             best = residual
             cameras = trial.cameras_at(state).to(torch.float64)
-            found = replace(measurements, cameras=cameras), replace(state, unknowns=None)
+            found = replace(measurements, cameras=cameras), state
     if found is None:
         assert failure is not None
         raise failure

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from typing import Any
 
-import torch
+from torch import Tensor
 
-from torchstickcal.model.unknowns import CLOCKS
-from torchstickcal.result import LENS_PARAMETERS, Calibration
+from torchstickcal.model.unknowns import all_unknowns
+from torchstickcal.result import Calibration, CameraParameter
 
 
 def table(calibration: Calibration) -> str:
@@ -27,25 +27,16 @@ def table(calibration: Calibration) -> str:
         for name, centre, std_m, std_deg, px, used in cameras
     ]
     text = [_aligned(rows), ""]
-    rows = [["lens", "focal (px)", "data / given", "found"]]
-    for index, name in enumerate(calibration.camera_names):
-        focal = float(calibration.intrinsics[index, [0, 1], [0, 1]].mean())
-        ratio, std = float(calibration.focal_ratio[index]), float(calibration.focal_ratio_std[index])
-        found = ", ".join(kind for kind in calibration.refined if kind not in CLOCKS)
-        rows.append([name, f"{focal:.2f}", f"{ratio:.4f} +- {std:.4f}", found or "-"])
-    text += [_aligned(rows), ""]
-    if calibration.times is not None:
-        rows = [["clock", "late (ms)", "data - used (ms)", "found"]]
-        for index, name in enumerate(calibration.camera_names):
-            offset, late = (_milliseconds(calibration, part, index) for part in ("time_offsets", "late"))
-            rows.append([name, offset, late, ", ".join(kind for kind in calibration.refined if kind in CLOCKS) or "-"])
-        text += [_aligned(rows), ""]
+    for name, parameter in calibration.unknowns.items():
+        known = bool(parameter.by_component("suggested").isfinite().any())
+        if known and (parameter.refined or all_unknowns()[name].noticeable is not None):
+            text += [_aligned(_parameter_rows(calibration, parameter)), ""]
     if calibration.sticks:
         rows = [["stick", "given (m)", "mean (m)", "spread (mm)", "frames"]]
         for stick, lengths in zip(calibration.sticks, calibration.stick_lengths_m.mT, strict=True):
             known = lengths[lengths.isfinite()]
             spread = f"{1000 * float(known.std()):.2f}" if len(known) > 1 else "-"
-            ends = f"{_point_name(calibration, stick.start)} - {_point_name(calibration, stick.end)}"
+            ends = " - ".join(_point_name(calibration, end) for end in stick.ends)
             mean = f"{float(known.mean()):.5f}" if len(known) else "-"
             rows.append([ends, f"{stick.length_m:.5f}", mean, spread, str(len(known))])
         text += [_aligned(rows), ""]
@@ -89,45 +80,7 @@ def summary(calibration: Calibration) -> dict[str, Any]:
             )
         ],
         "refined": list(calibration.refined),
-        "lenses": [
-            {
-                "name": name,
-                "focal_px": [matrix[0][0], matrix[1][1]],
-                "principal_point_px": [matrix[0][2], matrix[1][2]],
-                "focal_data_over_given": ratio,
-                "focal_data_over_given_std": ratio_std,
-                "std": dict(zip(LENS_PARAMETERS, lens_std, strict=True)),
-            }
-            for name, matrix, ratio, ratio_std, lens_std in zip(
-                calibration.camera_names,
-                calibration.intrinsics.tolist(),
-                calibration.focal_ratio.tolist(),
-                calibration.focal_ratio_std.tolist(),
-                calibration.lens_std.tolist(),
-                strict=True,
-            )
-        ],
-        "clocks": [
-            {
-                "name": name,
-                "time_offset_s": offset,
-                "time_offset_std_s": offset_std,
-                "data_minus_used_s": _finite(late),
-                "data_minus_used_std_s": _finite(late_std),
-                "readout_s": readout,
-                "readout_std_s": readout_std,
-            }
-            for name, offset, offset_std, late, late_std, readout, readout_std in zip(
-                calibration.camera_names,
-                calibration.time_offsets.tolist(),
-                calibration.time_offsets_std.tolist(),
-                calibration.late,
-                calibration.late_std,
-                calibration.readout.tolist(),
-                calibration.readout_std.tolist(),
-                strict=True,
-            )
-        ],
+        "unknowns": {name: _parameter_summary(calibration, parameter) for name, parameter in calibration.unknowns.items()},
         "points": [
             {"name": _point_name(calibration, index), "sigma_px": sigma}
             for index, sigma in enumerate(calibration.sigma_px.tolist())
@@ -135,8 +88,8 @@ def summary(calibration: Calibration) -> dict[str, Any]:
         "scale_std": _finite(calibration.scale_std),
         "sticks": [
             {
-                "start": stick.start,
-                "end": stick.end,
+                "start": stick.ends[0],
+                "end": stick.ends[1],
                 "length_m": stick.length_m,
                 "mean_m": _finite(lengths.nanmean()),
                 "spread_m": _finite(lengths[lengths.isfinite()].std(correction=0)),
@@ -160,9 +113,44 @@ def summary(calibration: Calibration) -> dict[str, Any]:
     }
 
 
-def _milliseconds(calibration: Calibration, part: str, camera: int) -> str:
-    value, std = (1000 * float(getattr(calibration, name)[camera]) for name in (part, f"{part}_std"))
-    return f"{value:.2f} +- {std:.2f}"
+def _parameter_rows(calibration: Calibration, parameter: CameraParameter) -> list[list[str]]:
+    """A table of one unknown of the cameras: what was given, what was used, and what the keypoints suggest."""
+    factor, unit = (1000, "ms") if parameter.unit == "s" else (1, parameter.unit)
+    components = parameter.components
+    in_unit = f" ({unit})" if unit else ""
+    heads = "estimated" if parameter.refined else "as given", "suggested"
+    rows = [[parameter.label, *(f"{component}{in_unit}: {head}" for component in components for head in heads)]]
+
+    def quantity(values: Tensor, stds: Tensor) -> str:
+        value, std = factor * float(values), factor * float(stds)
+        return f"{value:.5g}" if std != std else f"{value:.5g} ± {std:.2g}"
+
+    for camera, label in enumerate(calibration.camera_names):
+        cells = [
+            quantity(parameter.by_component(value)[camera, number], parameter.by_component(std)[camera, number])
+            for number in range(len(components))
+            for value, std in (("value", "std"), ("suggested", "suggested_std"))
+        ]
+        rows.append([label, *cells])
+    return rows
+
+
+def _parameter_summary(calibration: Calibration, parameter: CameraParameter) -> dict[str, Any]:
+    """One unknown of the cameras as JSON can hold it."""
+    tensors = ("value", "std", "given", "suggested", "suggested_std")
+    return {
+        "label": parameter.label,
+        "unit": parameter.unit,
+        "refined": parameter.refined,
+        "cameras": [
+            {"name": name}
+            | {
+                tensor: dict(zip(parameter.components, map(_finite, parameter.by_component(tensor)[camera]), strict=True))
+                for tensor in tensors
+            }
+            for camera, name in enumerate(calibration.camera_names)
+        ],
+    }
 
 
 def _keypoints_used(calibration: Calibration) -> list[int]:
@@ -173,7 +161,7 @@ def _point_name(calibration: Calibration, index: int) -> str:
     return calibration.point_names[index] if calibration.point_names else f"point {index}"
 
 
-def _finite(value: torch.Tensor) -> float | None:
+def _finite(value: Tensor) -> float | None:
     """JSON has no NaN."""
     return float(value) if bool(value.isfinite()) else None
 

@@ -51,9 +51,9 @@ def rig_figure(calibration: Calibration, frame: int | None = None) -> Figure:
         axes.text(apex[0], apex[1], apex[2], f" {name}", color=_CAMERA_COLOUR, fontsize=8)
     step = max(1, len(points) // _GHOST_FRAMES)
     for stick in calibration.sticks:
-        for ends in points[::step, [stick.start, stick.end]]:
+        for ends in points[::step, list(stick.ends)]:
             axes.plot(*ends.T, color=_STICK_COLOUR, alpha=0.15, linewidth=0.8)
-        axes.plot(*points[frame, [stick.start, stick.end]].T, color=_STICK_COLOUR, linewidth=2.5)
+        axes.plot(*points[frame, list(stick.ends)].T, color=_STICK_COLOUR, linewidth=2.5)
     index = {name: number for number, name in enumerate(calibration.point_names or ())}
     for first, second in _BONES:
         if first in index and second in index:

@@ -107,7 +107,7 @@ def scene_frames(session: SimulatedSession, view: View | None = None, trace_s: f
     assert session.truth.points is not None
     points, rotations = session.truth.points.numpy(), session.truth.rotations.numpy()
     centres = -(rotations.swapaxes(1, 2) @ session.truth.translations.numpy()[..., None])[..., 0]
-    stick_end = session.observations.sticks[0].end
+    _, stick_end = session.observations.sticks[0].ends
     trace = max(1, round(trace_s * session.fps))
     for frame in range(len(points)):
         yield view.draw(points[frame], points[max(0, frame - trace) : frame + 1, stick_end], centres, rotations)
@@ -123,7 +123,7 @@ def camera_frames(session: SimulatedSession, camera: int, width: int = 640) -> I
         picture = np.full((round(size[1] * scale), width, 3), _PAPER, np.uint8)
         seen = np.isfinite(keypoints).all(-1)
         pixels = np.round(np.nan_to_num(keypoints) * scale * 2**_SUBPIXEL_BITS).astype(np.int32)
-        for start, end, colour in [*_BONES, (stick.start, stick.end, _STICK)]:
+        for start, end, colour in [*_BONES, (*stick.ends, _STICK)]:
             if seen[start] and seen[end]:
                 cv2.line(picture, pixels[start], pixels[end], colour, 2, cv2.LINE_AA, _SUBPIXEL_BITS)
         for point in np.flatnonzero(seen):

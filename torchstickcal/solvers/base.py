@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from enum import StrEnum
 from typing import Protocol
 
-from torchstickcal.model.measurements import State
 from torchstickcal.model.objective import Objective
+from torchstickcal.model.state import State
 
 
 class Stop(StrEnum):

@@ -10,8 +10,8 @@ import math
 
 import torch
 
-from torchstickcal.model.measurements import State
 from torchstickcal.model.objective import Objective
+from torchstickcal.model.state import State
 from torchstickcal.solvers.base import IterationRecord, Listener, Outcome, Stop, Termination
 from torchstickcal.solvers.elimination.normal_equations import NormalEquations, Step
 

@@ -17,8 +17,8 @@ from torch.nn.functional import pad
 
 from torchstickcal.errors import ConfigError
 from torchstickcal.geometry.cameras import Intrinsics
-from torchstickcal.model.measurements import State
 from torchstickcal.model.objective import Objective
+from torchstickcal.model.state import State
 from torchstickcal.solvers.elimination.normal_equations import NormalEquations
 from torchstickcal.workers import on_worker
 
@@ -107,15 +107,14 @@ def attach(objective: Objective, minimum: State, mode: GradientMode, held: State
 
     Args:
         objective: of measurements whose pixels, confidence, cameras, lengths and priors may require gradients.
-        minimum: where the objective is least, with values of the further unknowns even where there are none, (B, 0).
+        minimum: where the objective is least.
         mode: how the gradients are found.
         held: the state whose rotations, translations and further unknowns, which may require gradients, were held; None where
             they were unknowns.
     """
     m, rig = objective.measurements, held or minimum
     cameras = (rig.rotations, rig.translations, rig.unknowns)
-    prior_sigma = m.unknowns and m.unknowns.prior_sigma
-    data = (m.pixels, m.confidence, m.lengths_m, m.cameras.matrix, m.cameras.distortion, prior_sigma)
+    data = (m.pixels, m.confidence, m.lengths_m, m.cameras.matrix, m.cameras.distortion, m.unknowns.prior_sigma)
     return State(*_Attached.apply(objective, minimum, mode, held is None, *cameras, *data))
 
 
@@ -125,11 +124,10 @@ class _Attached(torch.autograd.Function):
     @staticmethod
     def forward(  # pyright: ignore[reportIncompatibleMethodOverride]
         ctx: Any, objective: Objective, minimum: State, mode: GradientMode, cameras_free: bool, *inputs: Tensor | None
-    ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    ) -> tuple[Tensor, ...]:
         ctx.objective, ctx.minimum, ctx.mode, ctx.cameras_free = objective, minimum, mode, cameras_free
         ctx.save_for_backward(*inputs)
-        unknowns = _unknowns(minimum)
-        return minimum.rotations.clone(), minimum.translations.clone(), minimum.points.clone(), unknowns.clone()
+        return tuple(v.clone() for v in (minimum.rotations, minimum.translations, minimum.points, minimum.unknowns))
 
     @staticmethod
     @torch.autograd.function.once_differentiable
@@ -182,7 +180,7 @@ def _solved(objective: Objective, state: State, cameras_free: bool, gradient: Ta
 def _hessian_product(objective: Objective, state: State, vector: Tangent) -> Tangent:
     """The exact Hessian times a vector."""
     with torch.enable_grad():
-        leaves = [v.detach().requires_grad_() for v in (state.rotations, state.translations, state.points, _unknowns(state))]
+        leaves = [v.detach().requires_grad_() for v in (state.rotations, state.translations, state.points, state.unknowns)]
         slope = _slope(objective, State(*leaves), _of_all(state, vector))
         found = torch.autograd.grad(slope, leaves, allow_unused=True, materialize_grads=True)
     by_rotations, by_translations, by_points, by_unknowns = found
@@ -206,14 +204,8 @@ def _by_tangents(rotations: Tensor, by_rotations: Tensor, by_translations: Tenso
 def _of_all(state: State, step: Tangent) -> Tangent:
     """A step of all cameras (B, C, 6) and further unknowns (B, K), zero for those that are held."""
     held_cameras = state.translations.shape[1] - step.cameras.shape[1]
-    held_unknowns = _unknowns(state).shape[1] - step.unknowns.shape[1]
+    held_unknowns = state.unknowns.shape[1] - step.unknowns.shape[1]
     return step._replace(cameras=pad(step.cameras, (0, 0, held_cameras, 0)), unknowns=pad(step.unknowns, (0, held_unknowns)))
-
-
-def _unknowns(state: State) -> Tensor:
-    """A state's further unknowns of the cameras (B, K), where it has them."""
-    assert state.unknowns is not None
-    return state.unknowns
 
 
 def _with_data(objective: Objective, data: list[Tensor | None]) -> Objective:
@@ -223,8 +215,9 @@ def _with_data(objective: Objective, data: list[Tensor | None]) -> Objective:
     assert confidence is not None
     assert lengths_m is not None
     assert matrix is not None
+    assert prior_sigma is not None
     m = objective.measurements
     cameras = Intrinsics(matrix, distortion, m.cameras.fisheye)
-    unknowns = None if m.unknowns is None or prior_sigma is None else replace(m.unknowns, prior_sigma=prior_sigma)
+    unknowns = replace(m.unknowns, prior_sigma=prior_sigma)
     measurements = replace(m, pixels=pixels, confidence=confidence, lengths_m=lengths_m, cameras=cameras, unknowns=unknowns)
     return Objective(measurements, objective.losses)

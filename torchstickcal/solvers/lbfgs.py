@@ -14,8 +14,8 @@ from torch import Tensor
 
 from torchstickcal.extrinsics import Extrinsics
 from torchstickcal.geometry.symmetric import raised
-from torchstickcal.model.measurements import State
 from torchstickcal.model.objective import Objective
+from torchstickcal.model.state import State
 from torchstickcal.solvers.base import IterationRecord, Listener, Outcome, Stop, Termination
 from torchstickcal.solvers.elimination.normal_equations import NormalEquations
 from torchstickcal.solvers.elimination.points import PointElimination
@@ -28,8 +28,8 @@ class _ScaledUnknowns:
     """Poses and points of one session as functions of well-scaled unknowns that are zero at the start."""
 
     def __init__(self, system: NormalEquations, start: State) -> None:
-        hessian, pairs = raised(system.point_hessian, _DAMPING), system.objective.measurements.pairs
-        self._points = PointElimination(hessian, pairs[:0, 0], pairs[:0, 1], None)
+        hessian, no_pairs = raised(system.point_hessian, _DAMPING), system.objective.measurements.sticks[:0, 0]
+        self._points = PointElimination(hessian, no_pairs, no_pairs, None)
         self._cameras = torch.linalg.cholesky(system.reduced[0]).mT
         self._response = system.response()[0].flatten(1).mT
         self._extrinsics = Extrinsics(start.rotations[0], start.translations[0])
@@ -50,7 +50,7 @@ class _ScaledUnknowns:
             torch.cat([self._start.rotations[:, :1], rotations[None]], dim=1),
             torch.cat([self._start.translations[:, :1], translations[None]], dim=1),
             points,
-            self._start.unknowns if self._start.unknowns is None else self._start.unknowns + unknowns.mT,
+            self._start.unknowns + unknowns.mT,
         )
 
 
@@ -122,9 +122,7 @@ def _round(objective: Objective, unknowns: _ScaledUnknowns) -> State:
 
     def closure() -> Tensor:
         optimiser.zero_grad()
-        state = unknowns.state()
-        points = objective.measurements.by_frame(state.points).movedim(1, -1)
-        cost = torch.stack(list(objective.terms(state.rotations, state.translations, points, state.unknowns).values())).sum()
+        cost = torch.stack(list(objective.terms(unknowns.state()).values())).sum()
         cost.backward()
         return cost
 

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import torch
 
-from torchstickcal.model.measurements import State
 from torchstickcal.model.objective import Objective
+from torchstickcal.model.state import State
 from torchstickcal.solvers.elimination.normal_equations import NormalEquations
 
 _MAX_STEPS = 8

@@ -6,6 +6,8 @@ covariance is that of its triangulation, plus what the cameras' uncertainty carr
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import torch
 from torch import Tensor
 
@@ -13,8 +15,9 @@ from torchstickcal.geometry import se3
 from torchstickcal.geometry.cameras import Intrinsics
 from torchstickcal.geometry.symmetric import backward, cholesky, forward
 from torchstickcal.losses import Loss, ReprojectionLoss, StickLengthLoss
-from torchstickcal.model.measurements import Measurements, State
+from torchstickcal.model.measurements import Measurements
 from torchstickcal.model.objective import Objective
+from torchstickcal.model.state import State
 from torchstickcal.solvers.elimination.cross_blocks import cross_rows
 from torchstickcal.solvers.elimination.normal_equations import NormalEquations
 
@@ -22,27 +25,34 @@ _POINTS_AT_ONCE = 2000
 _OPEN = 1e-12
 
 
-def normal_objective(measurements: Measurements, sigma_px: Tensor, sigma_length_m: Tensor | float) -> Objective:
-    """What the likeliest state minimises where noise is normal; arguments as of :func:`camera_covariance`."""
-    losses: dict[str, Loss] = {"reprojection": ReprojectionLoss(sigma_px[:, None, None])}
-    if len(measurements.pairs):
-        losses["stick_length"] = StickLengthLoss(sigma_length_m)
-    return Objective(measurements, losses)
+def likelihood(measurements: Measurements, losses: Mapping[str, Loss], sigma_px: Tensor) -> Objective:
+    """The objective of normally distributed errors: its Hessian is the inverse covariance.
 
-
-def camera_covariance(measurements: Measurements, state: State, sigma_px: Tensor, sigma_length_m: Tensor | float) -> Tensor:
-    """Covariance of the tangents of all cameras but the first, metres and radians, and then of the cameras' K further unknowns.
-
-    (B, 6 (C - 1) + K, 6 (C - 1) + K), of keypoints with normal noise, and of the sticks' lengths as far as they hold; a length
-    given wrong is not in it. A direction that nothing determines, as the scale is without a stick, is left out.
+    Sticks count with their own tolerances where no loss says how well their lengths are known.
 
     Args:
         measurements: those that took part.
-        state: the solution.
-        sigma_px: noise of each point's keypoints, (B, P).
-        sigma_length_m: how well the lengths hold.
+        losses: of the stage that adjusted the cameras; those with a weight other than 1 have no standard deviation, and are
+            left out.
+        sigma_px: noise of each point's keypoints, (B, P), pixels.
     """
-    information = NormalEquations(normal_objective(measurements, sigma_px, sigma_length_m), state, cameras_free=True).reduced
+    found = {name: loss.likelihood(sigma_px) for name, loss in losses.items()}
+    normal: dict[str, Loss] = {name: loss for name, loss in found.items() if loss is not None}
+    if not any(isinstance(loss, StickLengthLoss) for loss in normal.values()):
+        normal["stick_length"] = StickLengthLoss(measurements.stick_sigma_m)
+    return Objective(measurements, normal)
+
+
+def camera_covariance(objective: Objective, state: State) -> Tensor:
+    """Covariance of the tangents of all cameras but the first, metres and radians, and then of the cameras' K further unknowns.
+
+    (B, 6 (C - 1) + K, 6 (C - 1) + K). A direction that nothing determines, as the scale without a stick, is left out.
+
+    Args:
+        objective: of normally distributed errors, :func:`likelihood`.
+        state: the solution.
+    """
+    information = NormalEquations(objective, state, cameras_free=True).reduced
     scale = information.diagonal(dim1=1, dim2=2).clamp_min(1e-300).rsqrt()
     values, vectors = torch.linalg.eigh(information * scale[:, :, None] * scale[:, None])
     inverse = torch.where(values > _OPEN * values[:, -1:], values.reciprocal(), 0.0)

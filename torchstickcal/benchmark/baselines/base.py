@@ -11,10 +11,11 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from torchstickcal.errors import CalibrationError
-from torchstickcal.model.measurements import Measurements, State
+from torchstickcal.model.measurements import Measurements
+from torchstickcal.model.state import State
 from torchstickcal.observations import Observations
 from torchstickcal.pipeline.initialise.triangulate import triangulate
-from torchstickcal.pipeline.stage import Ruler, scale_factors
+from torchstickcal.pipeline.scale import Ruler, scale_factors
 from torchstickcal.simulate import CubeViews
 
 Array = NDArray[np.float64]
@@ -83,7 +84,7 @@ def required(inputs: Inputs, name: str) -> Any:
 
 def joint_measurements(observations: Observations) -> Measurements:
     """The joints' measurements, without the sticks."""
-    ends = {end for stick in observations.sticks for end in (stick.start, stick.end)}
+    ends = {end for stick in observations.sticks for end in stick.ends}
     return Measurements.of(observations, [point for point in range(observations.num_points) if point not in ends])
 
 
@@ -117,4 +118,4 @@ def triangulated(measurements: Measurements, rotations: Tensor, translations: Te
     weights = measurements.confidence[0] * rays.isfinite().all(1)
     scale = _TRIANGULATION_RADIUS_PX / float(measurements.cameras.focal_px.mean())
     points = triangulate(rotations[0], translations[0], rays.nan_to_num(), weights, scale=scale)
-    return State(rotations, translations, points.nan_to_num()[None])
+    return State.of(rotations, translations, points.nan_to_num()[None])

@@ -21,7 +21,8 @@ from torchstickcal.benchmark.baselines.base import (
 )
 from torchstickcal.benchmark.baselines.frame_adjustment import FrameResiduals, adjust
 from torchstickcal.losses import ReprojectionLoss
-from torchstickcal.model.measurements import Measurements, State
+from torchstickcal.model.measurements import Measurements
+from torchstickcal.model.state import State
 
 _SIGMA_LENGTH_SHARE = 0.01
 _TINY = 1e-12
@@ -95,7 +96,7 @@ def linear_state(measurements: Measurements, rotations: Tensor, bones: Tensor) -
     reduced = (on_shifts.mT @ on_shifts + cross.mT @ response).sum(0)
     shifts = torch.linalg.eigh(reduced).eigenvectors[:, 0]
     points = (response @ shifts).view(-1, 3).mT
-    state = State(rotations[None], torch.cat([shifts.new_zeros(3), shifts]).view(1, cameras, 3), points[None])
+    state = State.of(rotations[None], torch.cat([shifts.new_zeros(3), shifts]).view(1, cameras, 3), points[None])
     in_front = ((state.in_cameras()[..., 2, :] > 0) & m.visible).sum()
     return state.scaled(torch.where(2 * in_front > m.visible.sum(), 1.0, -1.0)[None])
 

@@ -17,7 +17,7 @@ from torchstickcal.losses import Huber, ReprojectionLoss
 from torchstickcal.model.measurements import Measurements
 from torchstickcal.observations import Observations
 from torchstickcal.pipeline.initialise import initialise
-from torchstickcal.pipeline.stage import Ruler, scale_factors
+from torchstickcal.pipeline.scale import Ruler, scale_factors
 
 MIDDLE = "stick_middle"
 _SIGMA_M = 0.001
@@ -40,12 +40,12 @@ def ewand(inputs: Inputs) -> Estimate:
     if not observations.sticks:
         raise MissingInputError("no stick to use as a wand", where="Inputs.observations", got="no stick", expected="a stick")
     middle = _middle(observations)
-    ends = {end for stick in observations.sticks for end in (stick.start, stick.end)}
+    ends = {end for stick in observations.sticks for end in stick.ends}
     measurements = Measurements.of(observations, ends | set(middle))
     labels = [observations.camera_label(camera) for camera in range(observations.num_cameras)]
     state = initialise(measurements, InitialiseSettings(), labels)
     lengths_m = measurements.lengths_m.unbind(1)
-    known = [Ruler((s.start,), (s.end,), length_m, True) for s, length_m in zip(observations.sticks, lengths_m, strict=True)]
+    known = [Ruler(s.ends[:1], s.ends[1:], length_m, True) for s, length_m in zip(observations.sticks, lengths_m, strict=True)]
     state = state.scaled(scale_factors(measurements, state.points, known))
     adjusted = adjust(measurements, state, ReprojectionLoss(kernel=Huber()), _wand(measurements, middle))
     status = "converged" if adjusted.converged else "the bundle adjustment stopped before it had converged"
@@ -58,8 +58,8 @@ def _middle(observations: Observations) -> list[int]:
 
 
 def _wand(measurements: Measurements, middle: list[int]) -> FrameResiduals:
-    starts, ends = measurements.pairs.unbind(1)
-    complete, lengths_m = measurements.pair_active[0], measurements.lengths_m[0]
+    starts, ends = measurements.sticks.unbind(1)
+    complete, lengths_m = measurements.stick_active[0], measurements.lengths_m[0]
     with_middle = complete[:, :1] & measurements.by_frame(measurements.active[0])[:, middle]
 
     def residuals(points: Tensor) -> Tensor:

@@ -16,8 +16,9 @@ from torch import Tensor
 from torchstickcal.geometry import se3
 from torchstickcal.geometry.symmetric import IDENTITY, expand
 from torchstickcal.losses import ReprojectionLoss
-from torchstickcal.model.measurements import Measurements, State
+from torchstickcal.model.measurements import Measurements
 from torchstickcal.model.objective import Objective
+from torchstickcal.model.state import State
 from torchstickcal.solvers.elimination.cross_blocks import cross_rows
 
 _INITIAL_DAMPING = 1e-5

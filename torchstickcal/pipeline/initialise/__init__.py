@@ -9,7 +9,8 @@ import torch
 from torch import Tensor
 
 from torchstickcal.config import InitialiseSettings
-from torchstickcal.model.measurements import Measurements, State
+from torchstickcal.model.measurements import Measurements
+from torchstickcal.model.state import State
 from torchstickcal.pipeline.initialise.graph import propagate, spanning_tree
 from torchstickcal.pipeline.initialise.pairs import relate
 from torchstickcal.pipeline.initialise.triangulate import triangulate
@@ -37,7 +38,7 @@ def initialise(measurements: Measurements, settings: InitialiseSettings, labels:
     scale = _scale(measurements, settings)
     poses = propagate(edges, views, scale)
     rotations, translations = (torch.from_numpy(pose)[None].to(measurements.pixels.device) for pose in poses)
-    return State(rotations, translations, triangulated(measurements, rotations, translations, settings))
+    return State.of(rotations, translations, triangulated(measurements, rotations, translations, settings))
 
 
 def triangulated(measurements: Measurements, rotations: Tensor, translations: Tensor, settings: InitialiseSettings) -> Tensor:

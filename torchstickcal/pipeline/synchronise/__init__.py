@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from torchstickcal.pipeline.synchronise.common_clock import CLOCK_STAGE, on_one_clock
+from torchstickcal.pipeline.synchronise.common_clock import CLOCK_STAGE, synchronise_keypoints
 from torchstickcal.pipeline.synchronise.exposure import Exposures, Support
 from torchstickcal.pipeline.synchronise.frames import CommonFrames, on_common_frames
-from torchstickcal.pipeline.synchronise.search import ClockEstimate, out_of_step, search_offsets
+from torchstickcal.pipeline.synchronise.search import ClockEstimate, search_offsets, unsynchronised
 
 __all__ = [
     "CLOCK_STAGE",
@@ -14,7 +14,7 @@ __all__ = [
     "Exposures",
     "Support",
     "on_common_frames",
-    "on_one_clock",
-    "out_of_step",
     "search_offsets",
+    "synchronise_keypoints",
+    "unsynchronised",
 ]

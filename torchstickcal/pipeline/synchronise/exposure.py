@@ -1,12 +1,12 @@
-"""Keypoints brought to the common frames: each moved in the image by what its point moved between its exposure and the frame.
+"""Keypoints moved to the common frames: each by as much as its point moves in the image between its exposure and the frame.
 
-The movement is that of the points' own trajectories, as far as the cameras have found them, and not of the keypoints, whose
-noise would pass for motion. So clocks are adjusted like lenses, by columns of the camera system, and the trajectories are
-taken anew from each adjustment.
+The motion is taken from the trajectories of the estimated points, not from the keypoints, whose noise would look like motion.
+So clocks are estimated like lenses, by columns of the camera system, and the trajectories are renewed after each adjustment.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -14,7 +14,8 @@ import torch
 from torch import Tensor
 
 from torchstickcal.geometry.cameras import Intrinsics, inverse_depths
-from torchstickcal.model.measurements import Measurements, State
+from torchstickcal.model.measurements import Measurements
+from torchstickcal.model.state import State
 from torchstickcal.model.trajectories import Trajectories
 from torchstickcal.model.unknowns import ImageMotion
 from torchstickcal.pipeline.synchronise.frames import CommonFrames
@@ -22,18 +23,18 @@ from torchstickcal.solvers.uncertainty import point_variances
 
 
 class Support(NamedTuple):
-    """What holds the points of B sessions where they are."""
+    """How well the points of B sessions are known."""
 
     variance: Tensor
-    """of a point along an axis, (B, N), square metres; infinite where it is not known"""
+    """(B, N), of a point along an axis, square metres; infinite where it is not known"""
     views: Tensor
-    """how many cameras hold a point, (B, N)"""
+    """(B, N), number of cameras that see a point"""
     sigma_px: Tensor
-    """noise of each point's keypoints, (B, P)"""
+    """(B, P), noise of each point's keypoints, pixels"""
 
     @staticmethod
     def of(measurements: Measurements, state: State, sigma_px: Tensor) -> Support:
-        """That of the measurements that took part, at a state; the noise is that of each point's keypoints, (B, P)."""
+        """From the measurements that took part, at a state, with the noise (B, P) of each point's keypoints."""
         return Support(point_variances(measurements, state, sigma_px), measurements.visible.sum(1), sigma_px)
 
     def replaced(self, where: Tensor, other: Support) -> Support:
@@ -46,8 +47,8 @@ class Exposures:
     """When the keypoints of B sessions were exposed.
 
     Args:
-        delays: (B, C, N), frames after the common frame that they stand at, as far as that was told.
-        rows: (B, C, N), how far below the middle row they are, as shares of the image's height; zero where that is not known.
+        delays: (B, C, N), given time from the common frame to the exposure, in frames.
+        rows: (B, C, N), distance below the middle row as a fraction of the image height; zero where the size is not known.
     """
 
     delays: Tensor
@@ -55,47 +56,38 @@ class Exposures:
 
     @staticmethod
     def of(frames: CommonFrames, window: slice = slice(None)) -> Exposures:
-        """Those of a session on its common frames, or on some of them."""
+        """Exposures of a session on its common frames, or on some of them, by its timestamps and read-out time."""
         observations = frames.observations
-        told = Exposures.together(observations.keypoints[None, :, window], observations.image_size)
-        delays = frames.lags[None, :, window, None].expand(-1, -1, -1, observations.num_points).flatten(2)
+        ordinates = observations.keypoints[:, window, :, 1].double()
+        rows = torch.zeros_like(ordinates)
+        if observations.image_size is not None:
+            height = observations.image_size.expand(observations.num_cameras, 2)[:, 1].double()
+            rows = (ordinates / height[:, None, None] - 0.5).nan_to_num().clamp(-0.5, 0.5)
+        delays = frames.lags[:, window, None].expand_as(rows)
         if observations.readout_s is not None and frames.rate_hz is not None:
-            delays = delays + observations.readout_s * frames.rate_hz * told.rows
-        return replace(told, delays=delays)
+            delays = delays + observations.readout_s * frames.rate_hz * rows
+        return Exposures(delays.flatten(1)[None], rows.flatten(1)[None])
 
     @staticmethod
-    def together(keypoints: Tensor, image_size: Tensor | None) -> Exposures:
-        """Those of keypoints whose middle rows were exposed at the common frames, as far as told.
+    def stack(sessions: Sequence[Exposures]) -> Exposures:
+        """Exposures of several sessions as one batch."""
+        return Exposures(torch.cat([s.delays for s in sessions]), torch.cat([s.rows for s in sessions]))
+
+    def unmoved(self, measurements: Measurements) -> Measurements:
+        """Measurements with unknown clocks, as if nothing moved: as long as there are no trajectories."""
+        still = torch.zeros_like(measurements.pixels)
+        return replace(measurements, motion=self._motion(still, measurements.unknowns.given))
+
+    def on_common_frames(self, measurements: Measurements, state: State, support: Support) -> Measurements:
+        """Measurements with the keypoints moved to the common frames, and less weight where the motion in between is not known.
 
         Args:
-            keypoints: (B, C, F, P, 2), pixels, NaN where not seen.
-            image_size: (2,), (C, 2) or (B, C, 2), width and height, pixels; None where that is not known.
+            measurements: the keypoints as detected.
+            state: cameras, points and unknowns that say where the keypoints move.
+            support: how well the points are known.
         """
-        ordinates = keypoints[..., 1].double()
-        rows = torch.zeros_like(ordinates)
-        if image_size is not None:
-            height = image_size.expand(*keypoints.shape[:2], 2)[..., 1].double()
-            rows = (ordinates / height[..., None, None] - 0.5).nan_to_num().clamp(-0.5, 0.5)
-        return Exposures(torch.zeros_like(rows).flatten(2), rows.flatten(2))
-
-    def resting(self, measurements: Measurements) -> Measurements:
-        """Measurements with clocks among their unknowns as if nothing moved: where trajectories are not known yet."""
-        assert measurements.unknowns is not None
-        reckoned = torch.zeros_like(measurements.unknowns.prior_sigma)
-        return replace(measurements, motion=self._motion(torch.zeros_like(measurements.pixels), reckoned))
-
-    def placed(self, measurements: Measurements, state: State, support: Support) -> Measurements:
-        """Measurements with their keypoints moved to the common frames, and less weight where the motion between is not known.
-
-        Args:
-            measurements: the sessions as seen.
-            state: the cameras, points and unknowns at which to place them.
-            support: what holds the points.
-        """
-        m, unknowns = measurements, measurements.unknowns
-        delays = self.delays
-        if unknowns is not None and state.unknowns is not None:
-            delays = delays + unknowns.delays(self.rows, state.unknowns)
+        m = measurements
+        delays = self.delays + m.unknowns.delays(self.rows, state.unknowns)
         every_camera = m.cameras_at(state).to(torch.float64)
         pixels, velocity, confidence = m.pixels.clone(), torch.empty_like(m.pixels), m.confidence.clone()
         for session in range(m.sessions):
@@ -104,20 +96,19 @@ class Exposures:
             cameras, pose = every_camera[session], (state.rotations[session], state.translations[session])
             for columns, frames in zip(m.chunks(), m.frame_slices(), strict=True):
                 pieces, delay = trajectories.pieces(frames), delays[session, :, columns]
-                late, depth, moving = _seen(cameras, pose, pieces.positions(delay), pieces.velocities(delay))
+                exposed, depth, moving = _seen(cameras, pose, pieces.positions(delay), pieces.velocities(delay))
                 x, y, z = _in_cameras(pose, pieces.positions(torch.zeros_like(delay))).unbind(1)
-                moved = late - torch.stack(cameras.project_components(x, y, z), dim=1)
+                moved = exposed - torch.stack(cameras.project_components(x, y, z), dim=1)
                 pixels[session, ..., columns] -= moved.where(((depth > 0) & (z > 0))[:, None], 0.0).to(pixels.dtype)
                 velocity[session, ..., columns] = moving.where((depth > 0)[:, None], 0.0).to(pixels.dtype)
                 deviation = pieces.deviations_m(delay) * cameras.focal_px[:, None] * depth
                 variance_ratio = (deviation / support.sigma_px[session].repeat(frames.stop - frames.start)).square()
                 weights = confidence[session, :, columns]
                 weights /= 1 + weights * variance_ratio.to(pixels.dtype)
-        reckoned = torch.zeros(m.sessions, 0).to(state.points) if state.unknowns is None else state.unknowns
-        return replace(m, pixels=pixels, confidence=confidence, motion=self._motion(velocity, reckoned))
+        return replace(m, pixels=pixels, confidence=confidence, motion=self._motion(velocity, state.unknowns))
 
-    def _motion(self, velocity: Tensor, reckoned: Tensor) -> ImageMotion:
-        return ImageMotion(velocity, self.rows.to(velocity), reckoned)
+    def _motion(self, velocity: Tensor, reference: Tensor) -> ImageMotion:
+        return ImageMotion(velocity, self.rows.to(velocity), reference)
 
 
 def _seen(

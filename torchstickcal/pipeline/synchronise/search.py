@@ -73,7 +73,7 @@ def search_offsets(measurements: Measurements, max_offset_frames: float, noise_p
     return ClockEstimate(refined, refined.where(torch.tensor(determined), offsets.double()), determined, reasons)
 
 
-def out_of_step(measurements: Measurements, max_offset_frames: float, noise_px: float = 2.0) -> bool:
+def unsynchronised(measurements: Measurements, max_offset_frames: float, noise_px: float = 2.0) -> bool:
     """Whether some camera agrees with the first one clearly better at other frames than at those beside each other.
 
     Much quicker than the search; arguments as of :func:`search_offsets`.

@@ -23,13 +23,13 @@ from torch import Tensor
 
 from torchstickcal.geometry import se3
 from torchstickcal.geometry.symmetric import DIAGONAL, IDENTITY, inverse_diagonal, raised
-from torchstickcal.losses.base import CameraPointTerms, UnknownTerms
-from torchstickcal.model.measurements import State
+from torchstickcal.losses.base import CameraPointTerms, UnknownTerms, six_entries
 from torchstickcal.model.objective import PRIOR, Objective
-from torchstickcal.model.unknowns import CameraUnknowns, Columns
+from torchstickcal.model.state import State
+from torchstickcal.model.unknowns import Columns, RigUnknowns
 from torchstickcal.solvers.base import IterationRecord
 from torchstickcal.solvers.elimination.cross_blocks import cross_rows, symmetric_times
-from torchstickcal.solvers.elimination.parts import Couplings, Part, parts
+from torchstickcal.solvers.elimination.parts import BetweenFrames, Couplings, Part, WithinFrame, parts
 from torchstickcal.solvers.elimination.points import PointElimination
 from torchstickcal.solvers.elimination.tracks import TrackElimination
 
@@ -134,11 +134,11 @@ class NormalEquations:
         self._exact = exact
         self.objective, self.state = objective, state
         self._count = m.num_cameras - 1 if cameras_free else 0
-        self._unknowns: CameraUnknowns | None = m.unknowns if cameras_free else None
+        self._unknowns = m.unknowns if cameras_free else RigUnknowns.of((), m.cameras)
         self._damping = torch.as_tensor(damping, dtype=torch.float64, device=state.points.device).expand(m.sessions)
         self.terms = {name: state.points.new_zeros(m.sessions) for name in objective.losses}
         self._add_structure()
-        self._parts = parts(m, self._couplings)
+        self._parts = parts(m, objective.clusters, self._couplings)
         self._kept: list[_Eliminated] | None = None
         self._add_keypoints()
 
@@ -243,48 +243,46 @@ class NormalEquations:
         if not bool(m.active.all()):
             identity = self.point_hessian.new_tensor(IDENTITY)[:, None]
             self.point_hessian.copy_(torch.where(m.active[:, None], self.point_hessian, identity))
-        self._couplings = Couplings(self._add_pairs(), *self._add_tracks())
+        self._couplings = Couplings(self._add_frame_losses(), self._add_track_losses())
 
-    def _add_pairs(self) -> Tensor | None:
-        """Add the pair losses to the points' blocks; returns the coupling (B, 6, F, S)."""
-        m, coupling = self.objective.measurements, None
-        starts, ends = m.pairs.unbind(1)
+    def _add_frame_losses(self) -> WithinFrame:
+        """Add the frame losses to the points' blocks; returns the blocks between different points of a frame."""
+        m, between = self.objective.measurements, WithinFrame()
         hessian, gradient = m.by_frame(self.point_hessian), m.by_frame(self.point_gradient)
-        for name, pair in self.objective.linearise_pairs(self.state, self._exact).items():
-            self.terms[name] = self.terms[name] + pair.cost
-            block, slope = pair.hessian.to(hessian.dtype), pair.gradient.to(hessian.dtype)
-            hessian[..., starts] += block
-            hessian[..., ends] += block
-            gradient[..., starts] -= slope
-            gradient[..., ends] += slope
-            coupling = block if coupling is None else coupling + block
-        return coupling
+        for name, terms in self.objective.linearise_frames(self.state, self._exact).items():
+            self.terms[name] = self.terms[name] + terms.cost
+            blocks, slopes = terms.hessian.to(hessian.dtype), terms.gradient.to(hessian.dtype)
+            members = self.objective.groups[name].unbind(1)
+            for i, first in enumerate(members):
+                gradient.index_add_(-1, first, slopes[:, i])
+                hessian.index_add_(-1, first, six_entries(blocks[:, i, i].flatten(-2)).unflatten(-1, blocks.shape[-2:]))
+                for j, second in enumerate(members[i + 1 :], i + 1):
+                    between.add(first, second, blocks[:, i, j])
+        return between
 
-    def _add_tracks(self) -> tuple[Tensor | None, Tensor | None]:
-        """Add the track losses to the points' blocks; returns the couplings to the next and the second-next frame."""
+    def _add_track_losses(self) -> BetweenFrames | None:
+        """Add the track losses to the points' blocks; returns the couplings of a point's frames."""
         m = self.objective.measurements
-        if not self.objective.couples_frames:
-            return None, None
+        if not self.objective.track_losses:
+            return None
         hessian, gradient = m.by_frame(self.point_hessian), m.by_frame(self.point_gradient)
-        next_frame, second_frame = (hessian.new_zeros(m.sessions, m.frames - k, m.points_per_frame) for k in (1, 2))
-        frames = m.frames - 2
-        for name, track in self.objective.linearise_tracks(self.state).items():
-            self.terms[name] = self.terms[name] + track.cost
-            information, slope = track.scale.square().to(hessian.dtype), (track.scale[:, None] * track.residual)
-            for offset, factor in enumerate((1.0, -2.0, 1.0)):
-                gradient[:, :, offset : offset + frames] += factor * slope
+        coupling = [hessian.new_zeros(m.sessions, max(0, m.frames - step), m.points_per_frame) for step in (1, 2)]
+        for name, terms in self.objective.linearise_tracks(self.state).items():
+            self.terms[name] = self.terms[name] + terms.cost
+            stencil, frames = self.objective.track_losses[name].stencil, terms.scale.shape[1]
+            information, slope = terms.scale.square().to(hessian.dtype), terms.scale[:, None] * terms.residual
+            for i, factor in enumerate(stencil):
+                gradient[:, :, i : i + frames] += factor * slope
                 for axis in DIAGONAL:
-                    hessian[:, axis, offset : offset + frames] += factor**2 * information
-            next_frame[:, :-1] -= 2 * information
-            next_frame[:, 1:] -= 2 * information
-            second_frame += information
-        return next_frame, second_frame
+                    hessian[:, axis, i : i + frames] += factor**2 * information
+                for j, other in enumerate(stencil[i + 1 :], i + 1):
+                    coupling[j - i - 1][:, i : i + frames] += factor * other * information
+        return BetweenFrames(*coupling)
 
     def _add_keypoints(self) -> None:
         """The camera-point losses of every part, and its elimination where the cameras are unknowns."""
         m, count, zeros = self.objective.measurements, self._count, self.state.points.new_zeros
-        further = self._unknowns.count if self._unknowns else 0
-        kinds = len(self._unknowns.kinds) if self._unknowns else 0
+        further, kinds = self._unknowns.count, self._unknowns.components
         squares, weights = zeros(m.sessions, m.num_cameras), zeros(m.sessions, m.num_cameras)
         gradient_moments, hessian_moments = zeros(m.sessions, 3 * count, 4), zeros(m.sessions, 6 * count, 10)
         own_gradient, own_hessian = zeros(m.sessions, m.num_cameras, kinds), zeros(m.sessions, m.num_cameras, kinds, kinds)
@@ -332,7 +330,7 @@ class NormalEquations:
         )
         self.camera_gradient = gradient_moments.view(m.sessions, count, 12) @ gradient_map
         self.unknown_gradient = reduced.new_zeros(m.sessions, further)
-        if self._unknowns is not None:
+        if further:
             share = self._unknowns.share
             with_poses = own_moments.flatten(3) @ gradient_map
             own[:, : 6 * count, 6 * count :] = torch.einsum("ckj,bckt->bctj", share[1:], with_poses).flatten(1, 2)
@@ -347,13 +345,11 @@ class NormalEquations:
         self.reprojection_px = (squares / weights.clamp_min(1e-300)).sqrt()
 
     def _linearised(self, columns: Columns) -> dict[str, CameraPointTerms]:
-        return self.objective.linearise_chunk(self.state, columns, self._exact, self._unknowns is not None)
+        return self.objective.linearise_chunk(self.state, columns, self._exact, self._unknowns.count > 0)
 
     def _add_prior(self, hessian: Tensor) -> None:
         """The prior of the cameras' further unknowns, to the terms, their gradient and their block (B, K, K)."""
-        prior = self.objective.linearise_prior(self.state)
-        assert prior is not None
-        self.terms[PRIOR], gradient, information = prior
+        self.terms[PRIOR], gradient, information = self.objective.linearise_prior(self.state)
         self.unknown_gradient += gradient
         hessian.diagonal(dim1=1, dim2=2).add_(information)
 
@@ -382,7 +378,7 @@ class NormalEquations:
     def _coupled(self, gradient: Tensor, hessian: Tensor, unknown: UnknownTerms | None) -> _Coupled:
         """What ties some points to the cameras, of :func:`_summed`."""
         coupling = None
-        if self._unknowns is not None and unknown is not None:
+        if unknown is not None:
             share = self._unknowns.share.to(unknown.coupling.dtype).flatten(0, 1).mT
             coupling = (share @ unknown.coupling.flatten(3).flatten(1, 2)).unflatten(2, (3, -1))
         return _Coupled(hessian[:, 1:], gradient[:, 1:] if self._exact else None, coupling)

@@ -1,4 +1,4 @@
-"""Elimination of points that are coupled within one frame at most: single points (3 x 3) and sticks (6 x 6).
+"""Elimination of single points (3 x 3) and of pairs of points of one frame, as the ends of a stick (6 x 6).
 
 All blocks of a part of the columns are factored at once. With H = L L^T the factor serves as L^-1 b (half solve) and as H^-1 b.
 """
@@ -8,7 +8,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from torchstickcal.geometry.symmetric import backward, cholesky, expand, forward, gram
+from torchstickcal.geometry.symmetric import backward, cholesky, forward, gram
 from torchstickcal.solvers.elimination.cross_blocks import add_rotations, twist_rows
 
 
@@ -16,10 +16,10 @@ class PointElimination:
     """Cholesky factor of the structure's Hessian at n columns.
 
     Args:
-        hessian: diagonal blocks (B, 6, n), positive definite, the sticks' share included.
-        starts: (m,), columns that are one end of a stick.
-        ends: (m,), the columns of the other ends.
-        coupling: (B, 6, m), blocks M with -M between the two ends; None where there is none.
+        hessian: diagonal blocks (B, 6, n), positive definite, the pairs' shares included.
+        starts: (m,), columns of the first points of pairs.
+        ends: (m,), columns of their second points.
+        coupling: (B, 3, 3, m), the blocks between the first (rows) and the second; None where there is none.
     """
 
     def __init__(self, hessian: Tensor, starts: Tensor, ends: Tensor, coupling: Tensor | None) -> None:
@@ -28,7 +28,7 @@ class PointElimination:
             self._lower = cholesky(hessian)
             return
         at_starts = cholesky(hessian[..., starts])
-        self._coupling = forward(at_starts.unsqueeze(-3), expand(coupling))
+        self._coupling = forward(at_starts.unsqueeze(-3), -coupling.transpose(-3, -2))
         reduced = hessian.clone()
         reduced[..., ends] -= gram(self._coupling)
         self._lower = cholesky(reduced)

@@ -1,8 +1,9 @@
-"""Elimination of points that are coupled over time: block-banded in the frames, exact and linear in their number.
+"""Elimination of points that losses couple over time: block-banded in the frames, exact and linear in their number.
 
 A second difference couples three consecutive frames, so with two frames to a block a track's Hessian is block
 tridiagonal. It is factored by cyclic reduction: every second block is eliminated at once, all tracks side by side, and
-what is left is block tridiagonal again with half as many blocks. Stick ends form one track of 6 numbers a frame.
+what is left is block tridiagonal again with half as many blocks. Points that losses couple within a frame, as the ends of a
+stick, form one track.
 """
 
 from __future__ import annotations
@@ -78,24 +79,27 @@ def _inverse_factor(blocks: Tensor) -> Tensor:
 
 
 class TrackElimination:
-    """Cholesky factor of the structure's Hessian with coupling over time, for T tracks of q points each.
+    """Cholesky factor of the points' Hessian for T tracks of q points each that losses couple, within frames or over time.
 
     Args:
         hessian: diagonal blocks (B, 6, T, F, q) of the points, entries xx xy xz yy yz zz, the losses' shares included.
-        coupling: (B, 6, F, T), the blocks -M between the two points of a track in a frame; None where q is 1.
-        next_frame: (B, F - 1, T, q), the multiple of the identity that couples frames f and f + 1.
-        second_frame: (B, F - 2, T, q), the same for frames f and f + 2.
+        within: (B, T, F, 3 q, 3 q), blocks between different points of a frame, zero on the diagonal; None where q is 1.
+        between: multiples of the identity that couple frames f and f + 1, (B, F - 1, T, q), and f and f + 2,
+            (B, F - 2, T, q); None where frames are not coupled, and each is eliminated by itself.
     """
 
-    def __init__(self, hessian: Tensor, coupling: Tensor | None, next_frame: Tensor, second_frame: Tensor) -> None:
-        self._shape = hessian.shape[2:]
-        first, *second = (expand(member.flatten(2)).permute(0, 3, 1, 2) for member in hessian.unbind(-1))
-        diagonal = first
-        if coupling is not None:
-            between = -expand(coupling.transpose(2, 3).flatten(2)).permute(0, 3, 1, 2)
-            diagonal = torch.cat([torch.cat([first, between], -1), torch.cat([between, second[0]], -1)], -2)
-        by_track = diagonal.unflatten(1, self._shape[:2]).flatten(0, 1)
-        steps = (step.transpose(1, 2).flatten(0, 1).repeat_interleave(3, -1) for step in (next_frame, second_frame))
+    def __init__(self, hessian: Tensor, within: Tensor | None, between: tuple[Tensor, Tensor] | None) -> None:
+        diagonal = _block_diagonal(hessian)
+        if within is not None:
+            diagonal = diagonal + within
+        sessions, tracks, frames, _, _ = diagonal.shape
+        if between is None:
+            tracks, frames = tracks * frames, 1
+            nothing = hessian.new_zeros(sessions, 0, tracks, hessian.shape[-1])
+            between = nothing, nothing
+        self._shape = tracks, frames, hessian.shape[-1]
+        by_track = diagonal.reshape(sessions * tracks, frames, *diagonal.shape[-2:])
+        steps = (step.transpose(1, 2).flatten(0, 1).repeat_interleave(3, -1) for step in between)
         self._factor = BlockTridiagonal(*_two_frames_a_block(by_track, *steps))
 
     def reductions(
@@ -126,6 +130,13 @@ class TrackElimination:
         by_frame = by_frame.reshape(len(rhs) * tracks, frames, 3 * points, rhs.shape[1])
         padded = torch.nn.functional.pad(by_frame, (0, 0, 0, 0, 0, frames % 2))
         return padded.unflatten(1, (-1, 2)).flatten(2, 3)
+
+
+def _block_diagonal(entries: Tensor) -> Tensor:
+    """The blocks (B, T, F, 3 q, 3 q) with the symmetric matrices of entries (B, 6, T, F, q) on the diagonal."""
+    blocks = expand(entries.flatten(2)).unflatten(-1, entries.shape[2:])
+    own = torch.eye(entries.shape[-1]).to(entries)
+    return torch.einsum("bijtfq,qr->btfqirj", blocks, own).flatten(-2).flatten(-3, -2)
 
 
 def _two_frames_a_block(diagonal: Tensor, next_frame: Tensor, second_frame: Tensor) -> tuple[Tensor, Tensor]:

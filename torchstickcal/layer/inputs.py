@@ -1,0 +1,137 @@
+"""What a layer is given, checked and with a batch dimension throughout."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from torchstickcal.errors import ObservationError
+from torchstickcal.geometry.cameras import Intrinsics
+from torchstickcal.model.measurements import Measurements
+from torchstickcal.model.unknowns import RigUnknowns
+from torchstickcal.observations import Observations, Stick
+
+
+@dataclass(frozen=True)
+class LayerInputs:
+    """Arguments of a forward pass on B sessions of C cameras, F frames, P points and S sticks."""
+
+    keypoints: Tensor
+    """(B, C, F, P, 2), pixels, NaN where not seen"""
+    confidence: Tensor | None
+    """(B, C, F, P)"""
+    cameras: Intrinsics
+    """(B, C, ...), float64"""
+    lengths_m: Tensor
+    """(B, S), float64"""
+    image_size: Tensor | None
+    """(B, C, 2), width and height, pixels"""
+    sticks: tuple[Stick, ...]
+    point_names: tuple[str, ...] | None
+
+    @staticmethod
+    def of(
+        keypoints: Tensor,
+        intrinsics: Tensor | Intrinsics,
+        stick_lengths: Tensor | None,
+        confidence: Tensor | None,
+        image_size: Tensor | Sequence[int] | None,
+        sticks: Sequence[Stick],
+        point_names: Sequence[str] | None,
+    ) -> LayerInputs:
+        """Arguments with keypoints (B, C, F, P, 2), the others broadcast to as many sessions and cameras.
+
+        Raises:
+            ObservationError: if their shapes do not fit.
+        """
+        if keypoints.ndim != 5 or keypoints.shape[-1] != 2:
+            raise ObservationError(
+                "keypoints have the wrong shape",
+                where="keypoints",
+                got=tuple(keypoints.shape),
+                expected="(B, cameras, frames, points, 2) or (cameras, frames, points, 2)",
+            )
+        sessions, cameras = keypoints.shape[:2]
+        if stick_lengths is None:
+            stick_lengths = torch.tensor([stick.length_m for stick in sticks], dtype=torch.float64)
+        lens = intrinsics if isinstance(intrinsics, Intrinsics) else Intrinsics(intrinsics)
+        distortion = lens.distortion
+        if distortion is not None:
+            distortion = _expanded("distortion", distortion, (sessions, cameras, distortion.shape[-1]), keypoints)
+        if image_size is not None:
+            image_size = _expanded("image_size", torch.as_tensor(image_size), (sessions, cameras, 2), keypoints)
+        return LayerInputs(
+            keypoints,
+            None if confidence is None else confidence.reshape(keypoints.shape[:-1]),
+            Intrinsics(_expanded("intrinsics", lens.matrix, (sessions, cameras, 3, 3), keypoints), distortion, lens.fisheye),
+            _expanded("stick_lengths", stick_lengths, (sessions, len(sticks)), keypoints),
+            image_size,
+            tuple(sticks),
+            None if point_names is None else tuple(point_names),
+        )
+
+    def of_sessions(self, chosen: list[int]) -> LayerInputs:
+        """Some of the sessions."""
+        return replace(
+            self,
+            keypoints=self.keypoints[chosen],
+            confidence=None if self.confidence is None else self.confidence[chosen],
+            cameras=self.cameras[chosen],
+            lengths_m=self.lengths_m[chosen],
+            image_size=None if self.image_size is None else self.image_size[chosen],
+        )
+
+    def observations(self, session: int) -> Observations:
+        """One session, without gradients."""
+        distortion = self.cameras.distortion
+        lengths = self.lengths_m[session].tolist()
+        return Observations(
+            self.keypoints[session].detach(),
+            self.cameras.matrix[session].detach(),
+            [replace(stick, length_m=length) for stick, length in zip(self.sticks, lengths, strict=True)],
+            distortion=None if distortion is None else distortion[session].detach(),
+            confidence=None if self.confidence is None else self.confidence[session].detach(),
+            image_size=None if self.image_size is None else self.image_size[session].detach(),
+            point_names=self.point_names,
+            fisheye=self.cameras.fisheye,
+        )
+
+    def measurements(
+        self, seen: Measurements, solved: Measurements, refined: Sequence[str], groups: Sequence[str]
+    ) -> Measurements:
+        """The measurements that were solved, with gradients by what was given.
+
+        Args:
+            seen: the measurements as detected.
+            solved: the same, moved to common times and weighted.
+            refined: what was estimated of the cameras beside their poses.
+            groups: a label for each camera.
+        """
+        visible = seen.by_frame(seen.visible)
+        keypoints = torch.where(visible[..., None], self.keypoints.double(), 0.0)
+        confidence = visible.double() if self.confidence is None else self.confidence.double().where(visible, 0.0)
+        weight = (solved.confidence / seen.confidence).where(seen.visible, 0.0)
+        return replace(
+            solved,
+            pixels=keypoints.movedim(-1, 2).flatten(3) + (solved.pixels - seen.pixels),
+            confidence=confidence.flatten(2) * weight,
+            cameras=self.cameras,
+            lengths_m=self.lengths_m,
+            unknowns=RigUnknowns.of(refined, self.cameras, groups),
+        )
+
+
+def _expanded(name: str, tensor: Tensor, shape: tuple[int, ...], like: Tensor) -> Tensor:
+    """A tensor in float64, expanded to a shape.
+
+    Raises:
+        ObservationError: if it does not fit.
+    """
+    try:
+        return tensor.to(like.device, torch.float64).expand(shape)
+    except RuntimeError as error:
+        expected = f"{shape}, or fewer dimensions where all are alike"
+        raise ObservationError("the wrong shape", where=name, got=tuple(tensor.shape), expected=expected) from error

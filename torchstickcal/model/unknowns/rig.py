@@ -1,0 +1,175 @@
+"""The unknowns of a whole rig, as one vector that the solvers estimate beside poses and points."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from torchstickcal.errors import ConfigError
+from torchstickcal.geometry.cameras import Intrinsics, PixelMap
+from torchstickcal.model.unknowns.base import REFINEMENTS, CameraUnknown, ClockUnknown, ImageMotion, Sharing, View
+
+
+@dataclass(frozen=True)
+class RigUnknowns:
+    """The unknowns (K,) of a rig's C cameras, k numbers per camera, in B sessions. K is 0 where only poses are unknown.
+
+    Args:
+        unknowns: the unknowns; together they have k components.
+        share: (C, k, K), a camera's own values as a linear map of the rig's.
+        prior_sigma: (B, K), standard deviations of the values before anything was seen.
+    """
+
+    unknowns: tuple[CameraUnknown, ...]
+    share: Tensor
+    prior_sigma: Tensor
+
+    @staticmethod
+    def of(names: Sequence[str], cameras: Intrinsics, groups: Sequence[object] = ()) -> RigUnknowns:
+        """The unknowns that some of :data:`REFINEMENTS` stand for.
+
+        Args:
+            names: the refinements.
+            cameras: as given, (B, C).
+            groups: a label for each camera; cameras with the same label are a group. Empty: all cameras are one group.
+
+        Raises:
+            ConfigError: for an unknown name, and if there are labels, but not one for each camera.
+        """
+        sessions, count = cameras.focal_px.shape
+        labels = list(groups) if groups else [None] * count
+        if len(labels) != count:
+            raise ConfigError(
+                "camera groups do not fit the cameras",
+                where="camera_groups",
+                got=f"{len(labels)} labels",
+                expected=f"{count}, one for each camera",
+            )
+        unknowns: list[CameraUnknown] = []
+        columns: list[tuple[int, list[int]]] = []
+        priors: list[Tensor] = []
+        components = 0
+        for unknown, sharing in (REFINEMENTS[name] for name in names):
+            prior = unknown.prior(cameras)
+            for component in range(len(unknown.components)):
+                for members in _sharing_cameras(sharing, labels):
+                    columns.append((components, members))
+                    priors.append(prior[..., members, component].mean(-1))
+                components += 1
+            unknowns.append(unknown)
+        share = cameras.matrix.new_zeros(count, components, len(columns))
+        for column, (component, members) in enumerate(columns):
+            share[members, component, column] = 1.0
+        prior_sigma = torch.stack(priors, dim=-1) if priors else cameras.matrix.new_zeros(sessions, 0)
+        return RigUnknowns(tuple(unknowns), share, prior_sigma)
+
+    @staticmethod
+    def stack(sessions: Sequence[RigUnknowns]) -> RigUnknowns:
+        """The same unknowns in several sessions as one batch."""
+        return replace(sessions[0], prior_sigma=torch.cat([session.prior_sigma for session in sessions]))
+
+    def __getitem__(self, sessions: slice | list[int]) -> RigUnknowns:
+        """The unknowns of some of the sessions."""
+        return replace(self, prior_sigma=self.prior_sigma[sessions])
+
+    @property
+    def count(self) -> int:
+        """K"""
+        return self.share.shape[2]
+
+    @property
+    def components(self) -> int:
+        """k"""
+        return self.share.shape[1]
+
+    @property
+    def clocked(self) -> bool:
+        """Whether clocks are among them."""
+        return any(isinstance(unknown, ClockUnknown) for unknown in self.unknowns)
+
+    @property
+    def given(self) -> Tensor:
+        """(B, K), the values of cameras as given: zero."""
+        return torch.zeros_like(self.prior_sigma)
+
+    def by_camera(self, values: Tensor) -> Tensor:
+        """Every camera's own values (B, C, k), of the rig's (B, K)."""
+        return torch.einsum("ckj,bj->bck", self.share, values)
+
+    def by_name(self, values: Tensor) -> dict[str, Tensor]:
+        """Every camera's own values (B, C, n) by the name of the unknown, of the rig's (B, K)."""
+        return {unknown.name: own for unknown, own in self._split(self.by_camera(values))}
+
+    def variances(self, covariance: Tensor) -> dict[str, Tensor]:
+        """Variances (C, n) of every camera's own values by the name of the unknown, of the rig's covariance (K, K)."""
+        own = torch.einsum("ckj,jl,ckl->ck", self.share, covariance, self.share)
+        return {unknown.name: part[0] for unknown, part in self._split(own[None])}
+
+    def taken_over(self, others: RigUnknowns, values: Tensor) -> Tensor:
+        """Values (B, K) from those (B, K') of other unknowns where these have the same; zero elsewhere; means where shared."""
+        known = others.by_name(values)
+        cameras = len(self.share)
+        own = [known.get(u.name, values.new_zeros(len(values), cameras, len(u.components))) for u in self.unknowns]
+        together = torch.cat([*own, values.new_zeros(len(values), cameras, 0)], dim=-1)
+        return torch.einsum("ckj,bck->bj", self.share, together) / self.share.sum((0, 1))
+
+    def applied(self, cameras: Intrinsics, values: Tensor) -> Intrinsics:
+        """The cameras at values (B, K)."""
+        return self.applied_by_camera(cameras, self.by_camera(values))
+
+    def applied_by_camera(self, cameras: Intrinsics, values: Tensor) -> Intrinsics:
+        """The cameras at each camera's own values (B, C, k)."""
+        for unknown, own in self._split(values):
+            cameras = unknown.applied(cameras, own)
+        return cameras
+
+    def delays(self, row: Tensor, values: Tensor) -> Tensor:
+        """Delays (B, C, N) of the keypoints' exposures in frames, at values (B, K), for rows of :class:`ImageMotion`."""
+        return self.delays_by_camera(row, self.by_camera(values))
+
+    def delays_by_camera(self, row: Tensor, values: Tensor) -> Tensor:
+        """:meth:`delays` at each camera's own values (B, C, k)."""
+        delays = torch.zeros_like(row)
+        for unknown, own in self._split(values):
+            if isinstance(unknown, ClockUnknown):
+                delays = delays + unknown.factor(row) * own.to(row)
+        return delays
+
+    def displaced(self, pixels: Tensor, values: Tensor, motion: ImageMotion | None) -> Tensor:
+        """Keypoints (B, C, 2, N) moved along their motion to where other values (B, K) of the clocks place them."""
+        if motion is None:
+            return pixels
+        return pixels - motion.velocity * self.delays(motion.row, values - motion.reference).unsqueeze(-2)
+
+    def columns(
+        self, u: Tensor, v: Tensor, pixel: PixelMap, cameras: Intrinsics, motion: ImageMotion | None
+    ) -> tuple[Tensor, Tensor]:
+        """Derivatives of projections (x, y) by each camera's own values, each (B, C, k, N).
+
+        Args:
+            u, v: normalised coordinates, (B, C, N).
+            pixel: the projections there.
+            cameras: as they are.
+            motion: of the keypoints, where clocks are among the unknowns.
+        """
+        view = View(u, v, pixel, cameras, motion)
+        found = [unknown.columns(view) for unknown in self.unknowns]
+        points = u.shape[-1]
+        x, y = (torch.cat([c.expand(*c.shape[:-1], points) for c in axis], dim=-2) for axis in zip(*found, strict=True))
+        return x, y
+
+    def _split(self, by_camera: Tensor) -> list[tuple[CameraUnknown, Tensor]]:
+        """Each unknown with its own part (..., n) of values (..., k)."""
+        sizes = [len(unknown.components) for unknown in self.unknowns]
+        return list(zip(self.unknowns, by_camera.split(sizes, dim=-1), strict=True)) if sizes else []
+
+
+def _sharing_cameras(sharing: Sharing, labels: Sequence[object]) -> list[list[int]]:
+    """The cameras that have each value in common."""
+    everyone = range(len(labels))
+    if sharing is Sharing.GROUP:
+        return [[camera for camera in everyone if labels[camera] == label] for label in dict.fromkeys(labels)]
+    return [[camera] for camera in everyone[int(sharing is Sharing.RELATIVE) :]]

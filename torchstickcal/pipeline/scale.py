@@ -1,0 +1,99 @@
+"""Known lengths, and the closed-form scale that they give (the paper's stage 2)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from torchstickcal.config import Config
+from torchstickcal.errors import ConfigError, ObservationError
+from torchstickcal.model.measurements import Measurements
+from torchstickcal.observations import Observations
+
+_OUTLIER_CUT = 3.5
+_MAD_TO_SIGMA = 1.4826
+
+
+@dataclass(frozen=True)
+class Ruler:
+    """A known length: the distance between the means of two groups of points, on average over the session.
+
+    A rigid ruler has the same length in every frame, so that frames in which it seems to have another are outliers.
+    """
+
+    start: tuple[int, ...]
+    end: tuple[int, ...]
+    lengths_m: Tensor
+    """(B,), one for each session"""
+    rigid: bool
+
+    def measured_m(self, measurements: Measurements, points: Tensor) -> Tensor:
+        """Its length in every frame (B, F), NaN where not all its points are known, of points (B, 3, N), metres."""
+        by_frame, active = measurements.by_frame(points), measurements.by_frame(measurements.active)
+        start, end = list(self.start), list(self.end)
+        vectors = by_frame[..., end].mean(-1) - by_frame[..., start].mean(-1)
+        known = active[..., start + end].all(-1)
+        return vectors.square().sum(1).where(known, 1.0).sqrt().where(known, torch.nan)
+
+
+def rulers(sessions: Sequence[Observations], config: Config) -> list[Ruler]:
+    """What the scale comes from: the configuration's ``scale``, else the sticks, of sessions with the same points and sticks.
+
+    Raises:
+        ConfigError: if there is neither.
+        ObservationError: if ``scale`` names a point that the session does not have.
+    """
+    observations = sessions[0]
+
+    def lengths(values: list[float]) -> Tensor:
+        return torch.tensor(values, dtype=torch.float64, device=observations.keypoints.device)
+
+    if config.scale is not None:
+        start, end = (tuple(map(observations.point_index, names)) for names in (config.scale.start, config.scale.end))
+        return [Ruler(start, end, lengths([config.scale.length_m] * len(sessions)), rigid=False)]
+    if observations.sticks and config.points != "joints":
+        found: list[Ruler] = []
+        for number, stick in enumerate(observations.sticks):
+            start, end = stick.ends
+            found.append(Ruler((start,), (end,), lengths([s.sticks[number].length_m for s in sessions]), rigid=True))
+        return found
+    raise ConfigError(
+        "nothing sets the scale",
+        where="scale",
+        got=f"{len(observations.sticks)} sticks, points = {config.points!r}",
+        expected="a stick among the points that take part, or a [scale] table with a known length",
+    )
+
+
+def scale_factors(measurements: Measurements, points: Tensor, known: Sequence[Ruler]) -> Tensor:
+    """Known over mean reconstructed length, (B,); frames in which a rigid ruler is an outlier are left out.
+
+    Args:
+        measurements: the sessions.
+        points: (B, 3, N), up to scale.
+        known: the rulers.
+
+    Raises:
+        ObservationError: if in some session there is no frame in which a ruler's points are all known.
+    """
+    measured, expected = points.new_zeros(measurements.sessions), points.new_zeros(measurements.sessions)
+    for ruler in known:
+        lengths = ruler.measured_m(measurements, points)
+        if ruler.rigid:
+            median = lengths.nanmedian(1, keepdim=True).values
+            deviation = (lengths - median).abs()
+            limit = _OUTLIER_CUT * _MAD_TO_SIGMA * deviation.nanmedian(1, keepdim=True).values + 1e-12 * median
+            lengths = lengths.where(deviation <= limit, torch.nan)
+        measured += lengths.nansum(1)
+        expected += ruler.lengths_m * lengths.isfinite().sum(1)
+    if not bool((measured > 0).all()):
+        raise ObservationError(
+            "the length that sets the scale is never seen whole",
+            where="scale",
+            got="no frame",
+            expected="a frame in which all its points are seen by two cameras",
+        )
+    return expected / measured
