@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from torchstickcal.errors import CalibrationError, FileFormatError
 from torchstickcal.io import Truth, read_session
 from torchstickcal.observations import Observations
-from torchstickcal.simulate import ACTIONS, PRESETS, Cube, CubeViews, SessionSpec, SimulatedSession, preset, read_simulated
+from torchstickcal.simulate import PRESETS, SPORTS, Cube, CubeViews, SessionSpec, SimulatedSession, preset, read_simulated
 from torchstickcal.simulate.rigs import CameraRig
 from torchstickcal.simulate.skeleton import STANDING_HEIGHT_M
 
@@ -47,8 +47,8 @@ class Case:
         """What makes the case hard: its noise level in the paper's grid, else what its name begins with, before the sport."""
         if self.noise_px is not None:
             return f"{self.noise_px:g} px"
-        sport = next((action for action in ACTIONS if f"_{action}" in self.name), None)
-        return self.name.partition(f"_{sport}")[0].rstrip("0123456789") if sport else "-"
+        positions = [position for sport in SPORTS if (position := self.name.find(f"_{sport}")) >= 0]
+        return self.name[: min(positions)].rstrip("0123456789") if positions else "-"
 
     @property
     def seed(self) -> int:
