@@ -95,7 +95,10 @@ class Action:
 
 
 SPORTS: Registry[Action] = Registry("sport", "torchstickcal.simulate.motions")
-"""The action of each sport, by name. A module of this folder, or one of your own, adds a sport with ``SPORTS.register``."""
+"""The action of each sport, by name.
+
+A module of this folder, or one of your own, adds a sport with ``SPORTS.register("tennis", Action(...))``.
+"""
 
 
 def action(sport: str) -> Action:
