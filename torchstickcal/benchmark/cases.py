@@ -45,7 +45,7 @@ class Case:
 
     @property
     def regime(self) -> str:
-        """The group of the case in the tables: its noise level, else the part of its name before that of the sport."""
+        """The group of the case in the tables: its noise level, else the part of its name before the name of a sport."""
         if self.noise_px is not None:
             return f"{self.noise_px:g} px"
         positions = [position for sport in SPORTS if (position := self.name.find(f"_{sport}")) >= 0]

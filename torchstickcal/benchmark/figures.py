@@ -13,6 +13,7 @@ from torchstickcal.benchmark.methods import METHODS
 from torchstickcal.benchmark.run import Row
 
 _COLOURS = {"human_height": "#d1495b", "human_height_in_motion": "#e8a33d", "paper": "#4a9d77", "default": "#1f5fa8"}
+"""The methods that are drawn, with their colours."""
 _QUANTITIES: dict[str, Callable[[Row], float | None]] = {
     "rotation error (deg)": lambda row: row.rotation_deg,
     "translation error (m)": lambda row: row.translation_m,

@@ -23,4 +23,4 @@ MEMORY_MB: dict[int, tuple[float, float, float]] = {
 """By number of cameras: input, typical and worst peak memory of the last adjustment, megabytes."""
 
 MEDIAN_SECONDS: dict[int, float] = {3: 21.0, 10: 39.0}
-"""By number of cameras: median run time, seconds, as far as the text and a figure of the paper give it."""
+"""By number of cameras: median run time, seconds, where the text or a figure of the paper gives it."""

@@ -10,16 +10,17 @@ from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import asdict, dataclass
 from functools import lru_cache, partial
 from pathlib import Path
+from typing import NamedTuple
 
 import torch
 
 from torchstickcal.benchmark.baselines import Inputs, MissingInputError
 from torchstickcal.benchmark.bound import Bound, camera_bound
 from torchstickcal.benchmark.cases import Case, Source
-from torchstickcal.benchmark.memory import input_bytes, memory_needed
+from torchstickcal.benchmark.memory import Memory, input_bytes, memory_needed
 from torchstickcal.benchmark.methods import Method, method
 from torchstickcal.errors import CalibrationError, FileFormatError
-from torchstickcal.metrics import pose_errors
+from torchstickcal.metrics import PoseErrors, pose_errors
 
 ROWS_FILE = "rows.jsonl"
 CONVERGED, NOT_CONVERGED, FAILED, LACKS_INPUT = "converged", "not converged", "failed", "lacks an input"
@@ -147,24 +148,8 @@ def measure(place: str, source: Source, name: str) -> Row | None:
     if loaded is None:
         return None
     case, bound = loaded
-    seconds = needed = errors = None
-    try:
-        inputs = measured.inputs(case)
-        _warm_up(name, measured, inputs)
-        start = time.perf_counter()
-        estimate = measured.estimate(inputs)
-        seconds = time.perf_counter() - start
-        outcome, status = CONVERGED if estimate.status == "converged" else NOT_CONVERGED, estimate.status
-        truth = case.truth
-        if bool(estimate.translations.isfinite().all()):
-            errors = pose_errors(estimate.rotations, estimate.translations, truth.rotations, truth.translations)
-        else:
-            outcome = FAILED
-        needed = memory_needed(partial(measured.estimate, inputs)) if measured.profiled else None
-    except MissingInputError as error:
-        outcome, status = LACKS_INPUT, str(error)
-    except Exception as error:
-        outcome, status = FAILED, f"{type(error).__name__}: {error}".splitlines()[0]
+    found = _called(name, measured, case)
+    errors, needed = found.errors, found.needed
     return Row(
         place=place,
         case=case.name,
@@ -173,17 +158,48 @@ def measure(place: str, source: Source, name: str) -> Row | None:
         frames=case.observations.num_frames,
         noise_px=case.noise_px,
         method=name,
-        outcome=outcome,
-        status=status,
+        outcome=found.outcome,
+        status=found.status,
         rotation_deg=errors.mean_rotation_deg if errors else None,
         translation_m=errors.mean_translation_m if errors else None,
         bound_rotation_deg=bound.rotation_deg if bound else None,
         bound_translation_m=bound.translation_m if bound else None,
-        seconds=seconds,
+        seconds=found.seconds,
         input_bytes=input_bytes(case.observations),
         peak_resident_bytes=needed.resident_bytes if needed else None,
         peak_tensor_bytes=needed.tensor_bytes if needed else None,
     )
+
+
+class _Result(NamedTuple):
+    """The result of a call of a method: without errors if it failed."""
+
+    outcome: str
+    status: str
+    seconds: float | None = None
+    errors: PoseErrors | None = None
+    needed: Memory | None = None
+
+
+def _called(name: str, measured: Method, case: Case) -> _Result:
+    """Call a method on a case, and compare its estimate with the truth."""
+    seconds = None
+    try:
+        inputs = measured.inputs(case)
+        _warm_up(name, measured, inputs)
+        start = time.perf_counter()
+        estimate = measured.estimate(inputs)
+        seconds = time.perf_counter() - start
+        outcome, errors = FAILED, None
+        if bool(estimate.translations.isfinite().all()):
+            outcome = CONVERGED if estimate.status == "converged" else NOT_CONVERGED
+            errors = pose_errors(estimate.rotations, estimate.translations, case.truth.rotations, case.truth.translations)
+        needed = memory_needed(partial(measured.estimate, inputs)) if measured.profiled else None
+        return _Result(outcome, estimate.status, seconds, errors, needed)
+    except MissingInputError as error:
+        return _Result(LACKS_INPUT, str(error))
+    except Exception as error:
+        return _Result(FAILED, f"{type(error).__name__}: {error}".splitlines()[0], seconds)
 
 
 def _measured(place: str, missing: Sequence[tuple[Source, str]], jobs: int) -> Iterator[Row | None]:
