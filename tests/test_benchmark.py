@@ -1,4 +1,4 @@
-"""The benchmark: its bound, its tables from rows with known means, resuming, and its files."""
+"""The benchmark: the bound, tables of rows with known means, repeated runs, files, and methods of one's own."""
 
 from __future__ import annotations
 
@@ -13,7 +13,19 @@ import pytest
 import torch
 
 from torchstickcal import CalibrationError, calibrate
-from torchstickcal.benchmark import METHODS, Case, Row, camera_bound, method, run_benchmark, sources, write_results
+from torchstickcal.benchmark import (
+    BASELINES,
+    METHODS,
+    Baseline,
+    Case,
+    Listing,
+    Row,
+    camera_bound,
+    method,
+    run_benchmark,
+    sources,
+    write_results,
+)
 from torchstickcal.benchmark.memory import memory_needed
 from torchstickcal.benchmark.page import markdown
 from torchstickcal.benchmark.run import CONVERGED, FAILED, LACKS_INPUT, ROWS_FILE, measure, read_rows
@@ -66,7 +78,7 @@ def case_of(spec: SessionSpec) -> Case:
 # --- the bound ---------------------------------------------------------------------------------------------------------------
 
 
-def test_the_bound_is_what_a_maximum_likelihood_estimate_reaches():
+def test_maximum_likelihood_attains_the_bound():
     """Over drawn noise: the mean error of the default over the bound is 1, within three standard errors."""
     errors, bound = [], camera_bound(case_of(SPEC))
     assert bound is not None
@@ -96,7 +108,7 @@ def test_the_bound_grows_with_the_noise_and_falls_with_the_frames():
     assert few.translation_m > 1.4 * one.translation_m
 
 
-def test_outliers_tell_nothing():
+def test_outliers_do_not_count_for_the_bound():
     case = case_of(SPEC)
     assert case.inliers is not None
     half = np.ones_like(case.inliers)
@@ -116,7 +128,7 @@ def test_no_bound_without_truth_or_for_a_camera_without_inliers():
 
 
 def test_the_bound_of_the_papers_data(data: Path):
-    """Maximum likelihood reaches 0.0049 degrees and 0.36 mm at 0.3 px, mean over all cameras and sports."""
+    """Maximum likelihood attains 0.0049 degrees and 0.36 mm at 0.3 px, mean over all cameras and sports."""
     names = ("trajectory_circle_golf_noise0.3_cam5", "trajectory_figure8_baseball_noise0.3_cam5")
     found = [source for source in sources(str(data / "sports_stick_syn")) if source.name in names]
     bounds = [bound for source in found if (case := source.load()) and (bound := camera_bound(case))]
@@ -145,7 +157,7 @@ def test_cases_of_a_folder_and_of_a_preset(folder: Path):
     hard = sources("hard", 1)[0].load()
     assert hard is not None
     assert (hard.noise_px, hard.regime) == (None, "hard")
-    with pytest.raises(CalibrationError, match="nothing to measure on"):
+    with pytest.raises(CalibrationError, match="no such folder or preset"):
         sources("nowhere")
 
 
@@ -170,7 +182,7 @@ def test_memory_of_a_call():
 # --- running -----------------------------------------------------------------------------------------------------------------
 
 
-def test_what_is_measured_is_not_measured_again(folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+def test_existing_measurements_are_not_repeated(folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     out, names = tmp_path / "out", ["default", "aruco_cube"]
     first = run_benchmark("sessions", sources(str(folder)), names, out)
     assert [(row.method, row.outcome) for row in first] == [("default", CONVERGED), ("aruco_cube", LACKS_INPUT)]
@@ -191,9 +203,9 @@ def test_what_is_measured_is_not_measured_again(folder: Path, tmp_path: Path, mo
     assert len(read_rows(out / ROWS_FILE)) == 2
 
 
-def test_results_of_another_place_are_not_mixed_in(folder: Path, tmp_path: Path):
+def test_results_of_other_cases_are_refused(folder: Path, tmp_path: Path):
     run_benchmark("sessions", sources(str(folder)), ["aruco_cube"], tmp_path / "out")
-    with pytest.raises(CalibrationError, match="another benchmark"):
+    with pytest.raises(CalibrationError, match="results of another benchmark"):
         run_benchmark("elsewhere", sources(str(folder)), ["aruco_cube"], tmp_path / "out")
     with pytest.raises(CalibrationError, match="no process"):
         run_benchmark("sessions", sources(str(folder)), [], tmp_path / "out", jobs=0)
@@ -206,8 +218,8 @@ def test_a_method_that_raises_has_failed(folder: Path, monkeypatch: pytest.Monke
     def broken(inputs):
         raise ZeroDivisionError("by zero")
 
-    monkeypatch.setitem(METHODS, "default", dataclasses.replace(METHODS["default"], estimate=broken))
-    found = measure("sessions", sources(str(folder))[0], "default")
+    monkeypatch.setattr(BASELINES, "_things", {**BASELINES, "broken": Baseline(broken, Listing("Broken"))})
+    found = measure("sessions", sources(str(folder))[0], "broken")
     assert found is not None
     assert (found.outcome, found.status, found.translation_m) == (FAILED, "ZeroDivisionError: by zero", None)
     (folder / "broken.pkl").write_bytes(b"\x80\x04 nonsense")
@@ -219,14 +231,15 @@ def test_a_method_that_raises_has_failed(folder: Path, monkeypatch: pytest.Monke
 # --- tables ------------------------------------------------------------------------------------------------------------------
 
 
-def test_means_stand_next_to_the_papers():
+def test_means_stand_beside_the_published_ones():
     rows = [row(), row(case="b", rotation_deg=0.03, translation_m=0.003), row(method="kineo", translation_m=0.05)]
     found = {line[0]: line[1:] for line in state_of_the_art(rows).rows}
     assert found[METHODS["default"].title] == pytest.approx((0.02, 2.0, None, None, "2 of 2"))
     assert found[METHODS["kineo"].title] == pytest.approx((0.01, 50.0, 0.075, 98.0, "1 of 1"))
+    assert list(found)[:2] == ["Kineo", METHODS["default"].title]
     assert found["HSfM: not run, needs images and trained weights"] == (None, None, 0.193, 117.0, None)
     assert found["VGGT: not run, needs images and trained weights"] == (None, None, None, None, None)
-    assert "[kineo] On the paper's sequences 1 % of height" in state_of_the_art(rows).note
+    assert "[Kineo] A height error of 1 % changes" in state_of_the_art(rows).note
 
 
 def test_variances_of_inputs():
@@ -270,7 +283,7 @@ def test_efficiency_and_success():
     assert failures(rows).rows[0][1:] == (FAILED, "no", 1)
 
 
-def test_nothing_measured_is_no_table():
+def test_without_measurements_there_are_no_tables():
     assert tables([]) == []
 
 
@@ -332,9 +345,7 @@ def test_a_markdown_table_has_as_many_cells_as_its_header():
 # --- the command line --------------------------------------------------------------------------------------------------------
 
 
-def test_the_command_writes_everything_and_goes_on_where_it_was(
-    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-):
+def test_the_command_writes_everything_and_can_be_repeated(folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     out = tmp_path / "out"
     write_npz(folder / "no_truth.npz", SPEC.generate().observations)
     command = ["benchmark", str(folder), "--out", str(out), "--methods", "default,stick_only"]

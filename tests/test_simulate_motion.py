@@ -6,22 +6,26 @@ import numpy as np
 import pytest
 
 from torchstickcal import CalibrationError
-from torchstickcal.simulate import ACTIONS, Motion, action
-from torchstickcal.simulate.motions.base import interpolate
+from torchstickcal.simulate import SPORTS, Motion, action
+from torchstickcal.simulate.athlete import interpolate
 from torchstickcal.simulate.paths import PATHS, Path, Walk
 from torchstickcal.simulate.skeleton import JOINT_INDEX, JOINTS, PARENTS, Skeleton, bend, rotation
 
 PEAK_SPEEDS_M_S = {"golf": (30, 50), "baseball": (25, 35), "hockey": (20, 35), "kendo": (10, 25), "wand": (2, 8)}
-STICKS_M = {"golf": 1.00, "baseball": 0.86, "hockey": 1.60, "kendo": 1.20, "wand": 0.50}
+STICKS_M = {"baseball": 0.86, "golf": 1.00, "hockey": 1.60, "kendo": 1.20, "wand": 0.50}
 
 
-@pytest.fixture(params=ACTIONS)
+@pytest.fixture(params=SPORTS)
 def sport(request: pytest.FixtureRequest) -> str:
     return request.param
 
 
 def walking(sport: str, **changes) -> Motion:
-    return Motion(ACTIONS[sport], **({"path": Path("figure8"), "seed": 3} | changes))
+    return Motion(SPORTS[sport], **({"path": Path("figure8"), "seed": 3} | changes))
+
+
+def test_lengths_of_the_sticks():
+    assert {sport: SPORTS[sport].stick_m for sport in STICKS_M} == STICKS_M
 
 
 def test_bones_and_stick_keep_their_lengths_at_any_time(sport: str):
@@ -30,13 +34,14 @@ def test_bones_and_stick_keep_their_lengths_at_any_time(sport: str):
     for joint, parent in PARENTS.items():
         lengths = np.linalg.norm(points[:, JOINT_INDEX[joint]] - points[:, JOINT_INDEX[parent]], axis=1)
         np.testing.assert_allclose(lengths, motion.skeleton.bone_m(joint), rtol=0, atol=1e-12)
-    np.testing.assert_allclose(np.linalg.norm(points[:, 20] - points[:, 19], axis=1), STICKS_M[sport], rtol=0, atol=1e-12)
+    lengths = np.linalg.norm(points[:, 20] - points[:, 19], axis=1)
+    np.testing.assert_allclose(lengths, motion.action.stick_m, rtol=0, atol=1e-12)
 
 
 def test_the_stick_is_rigid_in_the_hands_that_hold_it(sport: str):
     motion = walking(sport)
     points = motion.points(np.linspace(0, 12, 1001))
-    along = (points[:, 20] - points[:, 19]) / STICKS_M[sport]
+    along = (points[:, 20] - points[:, 19]) / motion.action.stick_m
     for side, grip_m in motion.action.grips_m.items():
         hand = points[:, JOINT_INDEX[f"{side}_hand"]]
         np.testing.assert_allclose(hand, points[:, 19] + grip_m * along, rtol=0, atol=1e-12)
@@ -53,7 +58,8 @@ def test_accelerations_are_continuous(sport: str):
     assert (largest_change(1 / 8000) < 0.6 * largest_change(1 / 4000) + 1e-3).all()
 
 
-def test_sticks_are_as_fast_as_in_the_sport_and_tempo_scales_them(sport: str):
+@pytest.mark.parametrize("sport", PEAK_SPEEDS_M_S)
+def test_peak_speeds_are_those_of_the_sport_and_scale_with_tempo(sport: str):
     def peaks(motion: Motion) -> np.ndarray:
         step = 1 / 400 / motion.tempo
         tip = motion.points(np.arange(4 * round(motion.period_s / step)) * step)[:, 20]
@@ -75,8 +81,8 @@ def test_feet_do_not_slide_while_a_golfer_swings():
         assert np.ptp(foot, axis=0).max() < 1e-12
 
 
-def test_planted_feet_carry_a_walk():
-    """Standing feet are where the body's walk will have them, and at most one is in the air at a time."""
+def test_walking_feet_do_not_slide():
+    """Planted feet do not move, end beside the standing body, and hardly ever leave the floor both at once."""
     walk = Walk(Path("circle"), laps=0.5, start_s=1.0, end_s=2.5, period_s=3.0)
     times = np.linspace(0, 6, 1201)
     feet = [walk.foot(times, np.tile([x, 0.0, 0.0], (len(times), 1)), leads=x > 0) for x in (-0.2, 0.2)]
@@ -86,12 +92,12 @@ def test_planted_feet_carry_a_walk():
         assert 0.04 < foot[:, 2].max() <= 0.1
         planted = ~up[1:] & ~up[:-1]
         assert np.abs(np.diff(foot, axis=0)[planted]).max() < 0.01
-    place, turned = walk.body(np.array([2.9]))
-    stood = walk.foot(np.array([2.9]), np.array([[0.2, 0.0, 0.0]]), leads=True)
-    np.testing.assert_allclose(stood, place + 0.2 * turned[..., 0], atol=1e-12)
+    position, body = walk.body(np.array([2.9]))
+    standing = walk.foot(np.array([2.9]), np.array([[0.2, 0.0, 0.0]]), leads=True)
+    np.testing.assert_allclose(standing, position + 0.2 * body[..., 0], atol=1e-12)
 
 
-def test_repetitions_differ_a_little_and_the_seed_says_how(sport: str):
+def test_repetitions_vary_and_the_seed_determines_how(sport: str):
     times = np.linspace(0, action(sport).period_s, 50, endpoint=False)
     still = Path("stay")
     first, again = walking(sport, path=still).points(times), walking(sport, path=still).points(times + action(sport).period_s)
@@ -103,7 +109,7 @@ def test_repetitions_differ_a_little_and_the_seed_says_how(sport: str):
 
 
 @pytest.mark.parametrize("shape", PATHS[1:])
-def test_paths_close_and_are_headed_along_their_slope(shape: str):
+def test_paths_are_closed_and_headings_follow_them(shape: str):
     path = Path(shape, 0.5)
     laps = np.linspace(0, 1, 2001)
     places, headings = path.at(laps)
@@ -138,14 +144,14 @@ def test_bending_a_limb():
     root, goal = np.zeros((1, 3)), np.array([[0.0, 0.0, -0.8]])
     knee = bend(root, goal, 0.5, 0.5, np.array([[0.0, 2.0, 5.0]]))
     np.testing.assert_allclose(knee, [[0.0, 0.3, -0.4]], atol=1e-12)
-    with pytest.raises(CalibrationError, match=r"a limb cannot reach.*got 1.200 to 1.200 m; expected 0.000 to 1.000 m"):
+    with pytest.raises(CalibrationError, match=r"out of reach.*got 1.200 to 1.200 m; expected 0.000 to 1.000 m"):
         bend(root, 1.5 * goal, 0.5, 0.5, goal)
 
 
 def test_unknown_names_and_sizes_are_refused():
-    with pytest.raises(CalibrationError, match=r"unknown sport.*'curling'.*golf, baseball, hockey, kendo, wand"):
+    with pytest.raises(CalibrationError, match=r"unknown sport.*'curling'.*baseball, golf, hockey, kendo, wand"):
         action("curling")
     with pytest.raises(CalibrationError, match=r"unknown path.*circle, square, triangle, figure8"):
         Path("spiral")
-    with pytest.raises(CalibrationError, match=r"not a person's height.*176"):
+    with pytest.raises(CalibrationError, match=r"not the height of a person.*176"):
         Skeleton(176)

@@ -1,4 +1,4 @@
-"""Simulated sessions: cameras, clocks, what goes wrong with keypoints, files and presets."""
+"""Simulated sessions: cameras, clocks, errors of keypoints, files and presets."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ from torchstickcal import CalibrationError, FileFormatError, calibrate
 from torchstickcal.io import read_session, write_npz
 from torchstickcal.metrics import pose_errors
 from torchstickcal.simulate import (
-    ACTIONS,
     PRESETS,
+    SPORTS,
     Assumptions,
     Clocks,
     Cube,
@@ -53,8 +53,8 @@ def clean() -> np.ndarray:
     return keypoints(PLAIN)
 
 
-@pytest.mark.parametrize("sport", ACTIONS)
-def test_cameras_come_back_without_noise(sport: str):
+@pytest.mark.parametrize("sport", SPORTS)
+def test_calibration_is_exact_without_noise(sport: str):
     session = SessionSpec("exact", sport, cameras=4, frames=60, fps=20, lens=LENS, path="circle").generate()
     found = calibrate(session.observations)
     errors = pose_errors(found.rotations, found.translations, session.truth.rotations, session.truth.translations)
@@ -64,7 +64,7 @@ def test_cameras_come_back_without_noise(sport: str):
 
 @pytest.mark.parametrize("layout", LAYOUTS)
 @pytest.mark.parametrize("count", [2, 5, 16])
-def test_rigs_look_at_the_scene_from_distinct_places(layout: str, count: int):
+def test_cameras_look_at_the_scene_from_distinct_positions(layout: str, count: int):
     rig = camera_rig(layout, count, np.random.default_rng(0), LENS)
     np.testing.assert_allclose(rig.rotations @ rig.rotations.swapaxes(1, 2), np.tile(np.eye(3), (count, 1, 1)), atol=1e-12)
     centre = rig.project(np.tile(SCENE_CENTRE, (count, 1, 1)))[:, 0]
@@ -77,8 +77,8 @@ def test_rigs_look_at_the_scene_from_distinct_places(layout: str, count: int):
 
 
 @pytest.mark.parametrize("layout", LAYOUTS)
-def test_the_action_is_in_the_image_and_nothing_else_is_observed(layout: str):
-    for sport in ACTIONS:
+def test_the_athlete_is_in_the_image_and_all_keypoints_are(layout: str):
+    for sport in SPORTS:
         spec = SessionSpec(
             "x", sport, frames=60, fps=15, layout=layout, path="circle", regimes=(GaussianNoise(2.0), Outliers(0.1))
         )
@@ -96,7 +96,7 @@ def test_lenses_vary_when_asked():
     assert len(np.unique(rig.distortion[:, 0])) == 8
 
 
-def test_gaussian_noise_is_what_was_asked(clean: np.ndarray):
+def test_gaussian_noise_has_the_standard_deviation(clean: np.ndarray):
     session = replace(PLAIN, regimes=(GaussianNoise(0.5),)).generate()
     errors = session.observations.keypoints.numpy() - clean
     assert np.nanstd(errors) == pytest.approx(0.5, rel=0.02)
@@ -105,7 +105,7 @@ def test_gaussian_noise_is_what_was_asked(clean: np.ndarray):
     assert session.inliers.all()
 
 
-def test_detector_noise_has_heavy_tails_and_a_confidence_that_knows(clean: np.ndarray):
+def test_detector_noise_has_heavy_tails_and_a_related_confidence(clean: np.ndarray):
     session = replace(PLAIN, regimes=(DetectorNoise(2.5, 1.5),)).generate()
     errors = session.observations.keypoints.numpy() - clean
     assert np.sqrt(np.nanmean(errors[:, :, :19] ** 2)) == pytest.approx(2.5, rel=0.03)
@@ -122,7 +122,7 @@ def test_detector_noise_has_heavy_tails_and_a_confidence_that_knows(clean: np.nd
     assert by_joint.max() / by_joint.min() > 1.5
 
 
-def test_shares_of_what_is_missing():
+def test_shares_of_missing_keypoints():
     assert np.isnan(keypoints(replace(PLAIN, regimes=(Missing(0.15),)))[..., 0]).mean() == pytest.approx(0.15, abs=0.01)
     gone = np.isnan(keypoints(replace(PLAIN, regimes=(Gaps(0.15, mean_frames=5),)))[..., 0])
     assert gone.mean() == pytest.approx(0.15, abs=0.02)
@@ -137,7 +137,7 @@ def test_shares_of_what_is_missing():
     assert set(np.diff(np.flatnonzero(~slow[2]))) == {2, 3}
 
 
-def test_outliers_are_gross_and_declared(clean: np.ndarray):
+def test_outliers_are_large_and_marked(clean: np.ndarray):
     session = replace(PLAIN, regimes=(Outliers(0.12, reach_px=80.0),)).generate()
     moved = session.observations.keypoints.numpy() - clean
     assert (~session.inliers).mean() == pytest.approx(0.12, abs=0.01)
@@ -147,7 +147,7 @@ def test_outliers_are_gross_and_declared(clean: np.ndarray):
     assert gross.std() == pytest.approx(80 / np.sqrt(3), rel=0.05)
 
 
-def test_flips_exchange_sides_and_swaps_exchange_ends(clean: np.ndarray):
+def test_flips_swap_sides_and_swapped_ends_swap_ends(clean: np.ndarray):
     for regime, first, second, still in (
         (Flips(0.3), JOINT_INDEX["left_knee"], JOINT_INDEX["right_knee"], JOINT_INDEX["neck"]),
         (SwappedEnds(0.3), 19, 20, JOINT_INDEX["left_knee"]),
@@ -161,7 +161,7 @@ def test_flips_exchange_sides_and_swaps_exchange_ends(clean: np.ndarray):
         assert session.inliers[:, :, still].all()
 
 
-def test_what_stands_behind_a_limb_is_hidden():
+def test_a_point_behind_a_limb_is_hidden():
     points = np.tile([-50.0, 0.0, 50.0], (3, 21, 1)) + np.arange(21)[:, None] * [0, 1.0, 0]
     points[:, JOINT_INDEX["spine"]], points[:, JOINT_INDEX["neck"]] = [0, 0, 1.0], [0, 0, 1.4]
     hand = JOINT_INDEX["left_hand"]
@@ -207,9 +207,9 @@ def test_a_rolling_shutter_exposes_each_point_in_the_row_where_it_appears():
     assert np.nanmax(np.abs(pixels - frozen)) > 20
 
 
-def test_what_is_told_may_be_wrong_and_the_truth_says_so():
-    told = Assumptions(focal_scale=1.03, focal_spread=0.01, centre_px=4.0, lens_known=False, stick_scale=1.02)
-    session = replace(PLAIN, assumptions=told).generate()
+def test_given_intrinsics_may_be_wrong_and_the_truth_is_right():
+    wrong = Assumptions(focal_scale=1.03, focal_spread=0.01, centre_px=4.0, lens_known=False, stick_scale=1.02)
+    session = replace(PLAIN, assumptions=wrong).generate()
     truth = session.truth
     assert truth.intrinsics is not None
     assert truth.distortion is not None
@@ -222,7 +222,7 @@ def test_what_is_told_may_be_wrong_and_the_truth_says_so():
     assert torch.equal(session.observations.keypoints.nan_to_num(), PLAIN.generate().observations.keypoints.nan_to_num())
 
 
-def test_a_cube_shows_its_faces_to_those_it_faces():
+def test_a_camera_sees_the_faces_of_the_cube_that_face_it():
     spec = replace(PLAIN, lens=Lens(), cube=Cube(), cameras=8)
     session = spec.generate()
     cube, truth = session.cube, session.truth
@@ -247,7 +247,7 @@ def test_a_cube_shows_its_faces_to_those_it_faces():
     assert standing.corners_m.shape == (20, 3)
 
 
-def test_files_bring_everything_back(tmp_path):
+def test_files_hold_everything(tmp_path):
     specs = preset("sports-stick-syn")[0], preset("hard")[7], replace(PLAIN, frames=20, clocks=Clocks(0.1, 0.01))
     for spec in specs:
         session = spec.generate()
@@ -277,7 +277,7 @@ def test_a_session_that_was_not_simulated_is_refused(tmp_path, noisy):
         read_simulated(tmp_path / "recorded.npz")
 
 
-def test_the_seed_makes_the_session():
+def test_the_seed_determines_the_session():
     spec = replace(preset("hard")[1], frames=20, clocks=Clocks(0.1))
     first, second, other = spec.generate(), spec.generate(), replace(spec, seed=1).generate()
     for name in ("keypoints", "confidence", "intrinsics"):
@@ -291,7 +291,7 @@ def test_the_seed_makes_the_session():
     assert not torch.equal(first.truth.translations, other.truth.translations)
 
 
-def test_presets_are_what_they_say():
+def test_presets_are_as_documented():
     assert {name: len(preset(name)) for name in PRESETS} == {
         "sports-stick-syn": 160,
         "sports-stick-syn-random": 160,
@@ -306,14 +306,14 @@ def test_presets_are_what_they_say():
     }
     assert {spec.cameras for spec in paper} == set(range(3, 11))
     hard = preset("hard")
-    assert {spec.sport for spec in hard} == set(ACTIONS)
+    assert {spec.sport for spec in hard} == {"golf", "baseball", "hockey", "kendo", "wand"}
     assert {spec.layout for spec in hard} == set(LAYOUTS)
     assert {spec.cameras for spec in hard} == {2, 3, 4, 5, 6, 8}
     assert (min(spec.frames for spec in hard), max(spec.frames for spec in hard)) == (60, 300)
     assert {(spec.cameras, spec.frames) for spec in preset("regimes")} == {(6, 300)}
 
 
-def test_a_hard_session_is_as_hard_as_it_says():
+def test_a_hard_session_has_the_documented_errors():
     session = preset("hard")[59].generate()
     seen = session.observations.visible.numpy()
     flipped = ~session.inliers[:, :, JOINT_INDEX["left_knee"]] & ~session.inliers[:, :, JOINT_INDEX["right_knee"]]
@@ -330,11 +330,11 @@ def test_specifications_by_name():
         session_specs("curling")
     with pytest.raises(CalibrationError, match=r"no sessions to simulate \(count\): got 0"):
         session_specs("hard", count=0)
-    with pytest.raises(CalibrationError, match=r"not a seed.*got -1; expected 0 or more"):
+    with pytest.raises(CalibrationError, match=r"negative seed.*got -1; expected 0 or more"):
         session_specs("golf", seed=-1)
     with pytest.raises(CalibrationError, match=r"unknown preset.*'easy'.*hard"):
         preset("easy")
     with pytest.raises(CalibrationError, match=r"unknown layout.*'dome'.*hemisphere"):
         replace(PLAIN, layout="dome").generate()
-    with pytest.raises(CalibrationError, match=r"not a number of cameras.*got 17; expected 2 to 16"):
+    with pytest.raises(CalibrationError, match=r"unsupported number of cameras.*got 17; expected 2 to 16"):
         replace(PLAIN, cameras=17).generate()

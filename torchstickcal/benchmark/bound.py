@@ -1,4 +1,4 @@
-"""The Cramer-Rao bound of the camera errors, in the paper's measure."""
+"""The Cramér-Rao bound of the camera errors: the smallest mean errors that an unbiased method can have."""
 
 from __future__ import annotations
 
@@ -18,31 +18,39 @@ from torchstickcal.model.unknowns import RigUnknowns
 from torchstickcal.solvers.elimination.normal_equations import NormalEquations
 
 _SIGMA_LENGTH_M = 1e-5
-"""As good as exact: what the keypoints of a frame tell about the length is coarser by far."""
+"""Practically exact: the keypoints of a frame determine the length far less accurately."""
 
 
 @dataclass(frozen=True)
 class Bound:
-    """The least mean camera error that an unbiased estimate can be expected to have."""
+    """Smallest expected errors of an unbiased estimate, averaged over the cameras."""
 
     rotation_deg: float
     translation_m: float
 
 
 def camera_bound(case: Case, draws: int = 2000, seed: int = 0, unknown: Sequence[str] = ()) -> Bound | None:
-    """The bound of a case for those who know its inliers, their noise and the stick's length exactly, and its lenses.
+    """The Cramér-Rao bound of a case.
 
-    The inverse of the reduced camera system at the truth is the least covariance of the cameras. Errors drawn from it go
-    through the same alignment and the same mean as those of an estimate.
+    It holds for a method that knows the inliers, their noise, the length of the stick and the intrinsics exactly. The
+    covariance of the camera poses is the inverse of the reduced camera system at the truth. Errors are drawn from it, aligned
+    and averaged like the errors of an estimate.
 
     Args:
         case: a session with true points.
-        draws: errors drawn; their mean scatters by some 50 % / sqrt(draws).
+        draws: number of drawn errors; the standard error of their mean is about 50 % / sqrt(draws).
         seed: of the draws.
-        unknown: what of the lenses they do not know, as of :data:`torchstickcal.model.unknowns.REFINEMENTS`.
+        unknown: names of intrinsics or clock parameters that the method has to estimate too, see
+            :data:`torchstickcal.model.unknowns.REFINEMENTS`.
 
     Returns:
-        The bound; None where truth, noise or inliers are not known, or the inliers do not determine the cameras.
+        The bound; None if truth, noise or inliers are not known, or if the inliers do not determine the cameras.
+
+    Example:
+        >>> from torchstickcal.benchmark import camera_bound, sources
+        >>> bound = camera_bound(sources("sports-stick-syn", 1)[0].load())
+        >>> 0.001 < bound.rotation_deg < 0.003  # 0.1 px of noise, 3 cameras
+        True
     """
     truth = case.truth
     if truth.points is None or case.sigma_px is None or case.inliers is None:

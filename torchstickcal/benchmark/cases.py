@@ -1,4 +1,4 @@
-"""What is measured on: sessions with known truth, of a folder of files or of a preset of the simulator."""
+"""The cases of a benchmark: sessions with known truth, from a folder of files or from a preset of the simulator."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from torchstickcal.errors import CalibrationError, FileFormatError
 from torchstickcal.io import Truth, read_session
 from torchstickcal.observations import Observations
-from torchstickcal.simulate import ACTIONS, PRESETS, Cube, CubeViews, SessionSpec, SimulatedSession, preset, read_simulated
+from torchstickcal.simulate import PRESETS, SPORTS, Cube, CubeViews, SessionSpec, SimulatedSession, preset, read_simulated
 from torchstickcal.simulate.rigs import CameraRig
 from torchstickcal.simulate.skeleton import STANDING_HEIGHT_M
 
@@ -23,40 +23,41 @@ _NOISE = re.compile(r"_noise(\d+(?:\.\d+)?)(?:_|$)")
 
 @dataclass(frozen=True, eq=False)
 class Case:
-    """A session with its truth, and what else is known about it."""
+    """A session with its truth and further known values."""
 
     name: str
     observations: Observations
     truth: Truth
     inliers: NDArray[np.bool_] | None = None
-    """(C, F, P), False where a keypoint was drawn with a gross error"""
+    """(C, F, P), False for outliers"""
     sigma_px: NDArray[np.float64] | None = None
-    """(C, F, P), standard deviation along each axis that a keypoint was drawn with"""
+    """(C, F, P), standard deviation of the noise along each image axis, pixels"""
     cube: CubeViews | None = None
+    """keypoints of a calibration cube"""
     height_m: float | None = None
-    """of the athlete, standing"""
+    """stature of the athlete, metres"""
 
     @property
     def noise_px(self) -> float | None:
-        """The noise level of the paper's grid, which the name tells; None outside it."""
+        """Noise level in pixels, if the name contains one as those of the paper's sequences do (``_noise0.3``); else None."""
         found = _NOISE.search(self.name)
         return float(found[1]) if found else None
 
     @property
     def regime(self) -> str:
-        """What makes the case hard: its noise level in the paper's grid, else what its name begins with, before the sport."""
+        """The group of the case in the tables: its noise level, else the part of its name before the name of a sport."""
         if self.noise_px is not None:
             return f"{self.noise_px:g} px"
-        sport = next((action for action in ACTIONS if f"_{action}" in self.name), None)
-        return self.name.partition(f"_{sport}")[0].rstrip("0123456789") if sport else "-"
+        positions = [position for sport in SPORTS if (position := self.name.find(f"_{sport}")) >= 0]
+        return self.name[: min(positions)].rstrip("0123456789") if positions else "-"
 
     @property
     def seed(self) -> int:
-        """For whatever is drawn for this case; the same in every process."""
+        """Seed of random numbers for this case, the same in every process."""
         return zlib.crc32(self.name.encode())
 
     def first(self, frames: int) -> Case:
-        """The case cut down to its first frames."""
+        """The case with only its first frames."""
         given, truth = self.observations, self.truth
         return replace(
             self,
@@ -73,16 +74,16 @@ class Case:
 
 @dataclass(frozen=True)
 class Source:
-    """Where a case comes from: a file, or a specification to generate it from."""
+    """Origin of a case: a file, or a specification of a simulated session."""
 
     name: str
     origin: Path | SessionSpec
 
     def load(self) -> Case | None:
-        """The case; None if the session carries no truth.
+        """Read or generate the case; None if the session has no truth.
 
         Raises:
-            CalibrationError: if it cannot be read.
+            CalibrationError: if the session cannot be read.
         """
         if isinstance(self.origin, SessionSpec):
             return _of_simulated(self.origin.generate())
@@ -99,22 +100,31 @@ class Source:
 
 
 def sources(place: str, count: int | None = None) -> tuple[Source, ...]:
-    """The cases of a folder, by name, or of a preset, in its order; the first ``count``, by default all.
+    """The cases of a folder, sorted by name, or of a preset, in its order.
+
+    Args:
+        place: a folder of sessions (.npz or .pkl), or the name of a preset.
+        count: number of cases, from the first one; None for all.
 
     Raises:
-        CalibrationError: if there is neither such a folder nor such a preset, or no session in it.
+        CalibrationError: if there is no such folder or preset, or no session in the folder.
+
+    Example:
+        >>> from torchstickcal.benchmark import sources
+        >>> [source.name for source in sources("hard", 2)]
+        ['hard00_golf_hemisphere_cam2', 'hard01_baseball_random_cam2']
     """
     folder = Path(place)
     if folder.is_dir():
         files = sorted(path for path in folder.iterdir() if path.suffix in _SUFFIXES)
         if not files:
-            raise FileFormatError("no sessions", where=place, got="no such file", expected="files .npz or .pkl")
+            raise FileFormatError("no sessions", where=place, got="no such files", expected="files .npz or .pkl")
         found = tuple(Source(path.stem, path) for path in files)
     elif place in PRESETS:
         found = tuple(Source(spec.name, spec) for spec in preset(place))
     else:
         expected = f"a folder of sessions, or a preset: {', '.join(PRESETS)}"
-        raise CalibrationError("nothing to measure on", where="benchmark", got=repr(place), expected=expected)
+        raise CalibrationError("no such folder or preset", where="benchmark", got=repr(place), expected=expected)
     return found[:count]
 
 
@@ -131,7 +141,7 @@ def _of_simulated(session: SimulatedSession) -> Case:
 
 
 def _completed(case: Case) -> Case:
-    """A sequence of Sports-Stick-Syn with what its file leaves out: its noise is Gaussian, its skeleton the simulator's."""
+    """A sequence of Sports-Stick-Syn with the values that its file lacks: noise (Gaussian), cube, stature."""
     given, noise = case.observations, case.noise_px
     assert given.image_size is not None
     width, height = given.image_size.expand(given.num_cameras, 2)[0].round().int().tolist()

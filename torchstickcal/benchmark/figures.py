@@ -1,4 +1,4 @@
-"""The measurements as pictures: violins of the errors, boxes of the run times, and the effect of frames and cameras."""
+"""Figures of the benchmark: violin plots of the errors, box plots of the run times, effect of the number of frames."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ from torchstickcal.benchmark.methods import METHODS
 from torchstickcal.benchmark.run import Row
 
 _COLOURS = {"human_height": "#d1495b", "human_height_in_motion": "#e8a33d", "paper": "#4a9d77", "default": "#1f5fa8"}
+"""The methods that are drawn, with their colours."""
 _QUANTITIES: dict[str, Callable[[Row], float | None]] = {
     "rotation error (deg)": lambda row: row.rotation_deg,
     "translation error (m)": lambda row: row.translation_m,
@@ -24,23 +25,23 @@ _BOUNDS: dict[str, Callable[[Row], float | None]] = {
 
 
 def figures(rows: Sequence[Row]) -> dict[str, tuple[str, Figure]]:
-    """The pictures that the rows fill, with their captions, by name."""
+    """The figures for which something was measured, with their captions, by name."""
     noisy = [row for row in rows if row.noise_px is not None]
     made = {
         "errors_by_cameras": (
-            "Errors by number of cameras; each dot is a session. Dashes: the mean bound.",
+            "Errors by number of cameras; each dot is a session. Dashed: mean Cramér-Rao bound.",
             _violins(rows, "cameras", lambda row: row.cameras),
         ),
         "errors_by_noise": (
-            "Errors by noise of the keypoints; each dot is a session. Dashes: the mean bound.",
+            "Errors by noise of the keypoints; each dot is a session. Dashed: mean Cramér-Rao bound.",
             _violins(noisy, "noise (px)", lambda row: row.noise_px),
         ),
         "run_time": (
-            "Run time by number of cameras: median, quartiles, and whiskers to 1.5 times their distance.",
+            "Run time by number of cameras: median, quartiles, and whiskers up to 1.5 times the interquartile range.",
             _boxes(rows),
         ),
         "frames": (
-            "Mean error of `default` by number of frames, and the mean bound (dashed), for each number of cameras.",
+            "Mean error of `default` by number of frames and of cameras. Dashed: mean Cramér-Rao bound.",
             _effect_of_frames(rows),
         ),
     }
@@ -48,7 +49,7 @@ def figures(rows: Sequence[Row]) -> dict[str, tuple[str, Figure]]:
 
 
 def _violins(rows: Sequence[Row], label: str, key: Callable[[Row], float | None]) -> Figure | None:
-    """Distributions of both errors, a group of violins for each value of a key; None if there is nothing to draw."""
+    """Violin plots of both errors, grouped by a key; None if there is nothing to draw."""
     drawn = [row for row in rows if row.method in _COLOURS and row.rotation_deg is not None and row.cameras]
     methods = [name for name in _COLOURS if any(row.method == name for row in drawn)]
     groups = sorted({value for row in drawn if (value := key(row)) is not None})
@@ -58,13 +59,15 @@ def _violins(rows: Sequence[Row], label: str, key: Callable[[Row], float | None]
     width = 0.8 / len(methods)
     for axes, (quantity, value) in zip(figure.subplots(1, 2), _QUANTITIES.items(), strict=True):
         for number, name in enumerate(methods):
-            for place, group in enumerate(groups):
+            for position, group in enumerate(groups):
                 errors = [found for row in drawn if row.method == name and key(row) == group and (found := value(row))]
-                _violin(axes, errors, place + (number - (len(methods) - 1) / 2) * width, width, _COLOURS[name])
-        for place, group in enumerate(groups):
+                _violin(axes, errors, position + (number - (len(methods) - 1) / 2) * width, width, _COLOURS[name])
+        for position, group in enumerate(groups):
             bounds = [bound for row in drawn if key(row) == group and (bound := _BOUNDS[quantity](row))]
             if bounds:
-                axes.hlines(np.mean(bounds), place - 0.45, place + 0.45, colors="0.2", linestyles=(0, (4, 2)), linewidth=1.0)
+                axes.hlines(
+                    np.mean(bounds), position - 0.45, position + 0.45, colors="0.2", linestyles=(0, (4, 2)), linewidth=1.0
+                )
         axes.set_yscale("log")
         axes.set_xticks(range(len(groups)), [f"{group:g}" for group in groups])
         axes.set_xlabel(label)
@@ -75,8 +78,8 @@ def _violins(rows: Sequence[Row], label: str, key: Callable[[Row], float | None]
     return figure
 
 
-def _violin(axes: Axes, errors: Sequence[float], place: float, width: float, colour: str) -> None:
-    """A violin on a logarithmic axis: the density of the logarithms between the least and the largest, and the values."""
+def _violin(axes: Axes, errors: Sequence[float], position: float, width: float, colour: str) -> None:
+    """A violin on a logarithmic axis: the kernel density of the logarithms, the values as dots, and the median."""
     if not errors:
         return
     logs = np.log10(errors)
@@ -86,24 +89,26 @@ def _violin(axes: Axes, errors: Sequence[float], place: float, width: float, col
         at = np.linspace(logs.min(), logs.max(), 120)
         density = np.exp(-0.5 * ((at[:, None] - logs) / spread) ** 2).sum(1)
         half = 0.46 * width * density / density.max()
-        axes.fill_betweenx(10**at, place - half, place + half, color=colour, alpha=0.35, linewidth=0)
+        axes.fill_betweenx(10**at, position - half, position + half, color=colour, alpha=0.35, linewidth=0)
         offsets = 0.5 * np.interp(logs, at, half) * np.cos(2.4 * np.arange(len(logs)))
-    axes.scatter(place + offsets, errors, s=5, color=colour, linewidths=0, alpha=0.8)
-    axes.hlines(np.median(errors), place - 0.35 * width, place + 0.35 * width, colors=colour, linewidth=1.6)
+    axes.scatter(position + offsets, errors, s=5, color=colour, linewidths=0, alpha=0.8)
+    axes.hlines(np.median(errors), position - 0.35 * width, position + 0.35 * width, colors=colour, linewidth=1.6)
 
 
 def _boxes(rows: Sequence[Row]) -> Figure | None:
-    timed = [row for row in rows if row.seconds is not None and row.method in {"paper", "default"}]
+    """Box plots of the run time by number of cameras; None if there is nothing to draw."""
+    profiled = [name for name in _COLOURS if METHODS[name].profiled]
+    timed = [row for row in rows if row.seconds is not None and row.method in profiled]
     cameras = sorted({row.cameras for row in timed})
-    methods = [name for name in ("paper", "default") if any(row.method == name for row in timed)]
+    methods = [name for name in profiled if any(row.method == name for row in timed)]
     if not timed:
         return None
     figure = Figure(figsize=(6.5, 3.6), layout="constrained")
     axes = figure.subplots()
     for number, name in enumerate(methods):
         times = [[row.seconds or 0.0 for row in timed if row.method == name and row.cameras == count] for count in cameras]
-        places = np.arange(len(cameras)) + 0.4 * (number - (len(methods) - 1) / 2)
-        boxes = axes.boxplot([t or [np.nan] for t in times], positions=places, widths=0.32, patch_artist=True, sym=".")
+        positions = np.arange(len(cameras)) + 0.4 * (number - (len(methods) - 1) / 2)
+        boxes = axes.boxplot([t or [np.nan] for t in times], positions=positions, widths=0.32, patch_artist=True, sym=".")
         for part in boxes["boxes"]:
             part.set(facecolor=_COLOURS[name], alpha=0.45, edgecolor=_COLOURS[name])
         for part in boxes["medians"]:
@@ -119,6 +124,7 @@ def _boxes(rows: Sequence[Row]) -> Figure | None:
 
 
 def _effect_of_frames(rows: Sequence[Row]) -> Figure | None:
+    """Mean errors and bounds by number of frames, a line for each number of cameras; None for a single number of frames."""
     lengths = {name for name, method in METHODS.items() if name == "default" or method.frames is not None}
     solved = [row for row in rows if row.method in lengths and row.rotation_deg is not None]
     cameras = sorted({row.cameras for row in solved})

@@ -1,43 +1,49 @@
-"""What is measured: every configuration and every comparison method, by name."""
+"""The methods that the benchmark measures: the library's configurations and the baselines, by name."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
 
-import torch
-
-from torchstickcal.benchmark.baselines import BASELINES, Estimate, Inputs, bone_lengths, limb_orientations
+from torchstickcal.benchmark.baselines import BASELINES, Estimate, Inputs, Listing, bone_lengths, limb_orientations
+from torchstickcal.benchmark.baselines.base import OWN_CONFIGURATIONS
 from torchstickcal.benchmark.cases import Case
+from torchstickcal.benchmark.configurations import LISTINGS, PROFILED, listing_of
 from torchstickcal.config import config_names
-from torchstickcal.errors import CalibrationError
+from torchstickcal.errors import ConfigError
 from torchstickcal.pipeline.calibrate import calibrate
+from torchstickcal.registry import suggestion
 
-LIFTER_SIGMA_DEG = 5.0
-"""Errors of the limb directions that CalibPerson is given, along each axis: those of a good network."""
+LIMB_SIGMA_DEG = 5.0
+"""Noise of the limb directions that CalibPerson is given, along each of two axes, degrees: that of a good network."""
 
 _FEW_FRAMES = (5, 10, 20)
 
 
 @dataclass(frozen=True)
 class Method:
-    """A way to calibrate.
+    """A way to calibrate, as the benchmark measures it.
 
     Args:
-        title: for tables.
+        listing: how it appears in the tables.
         estimate: the method.
-        height_in_motion: the height it is given is the true mean distance from head to ankles in this session, which only
-            the truth can tell, instead of the athlete's stature.
-        frames: only the first of a session that it sees; None for all.
-        profiled: whether the memory it needs is measured too, in runs of their own.
+        height_in_motion: whether it is given the true mean distance from head to ankles in the session, which is known only
+            from the truth, instead of the athlete's stature.
+        frames: number of frames of a session that it is given, from the first one; None for all.
+        profiled: whether its memory is measured too, in calls of their own.
     """
 
-    title: str
+    listing: Listing
     estimate: Callable[[Inputs], Estimate]
     height_in_motion: bool = False
     frames: int | None = None
     profiled: bool = False
+
+    @property
+    def title(self) -> str:
+        """Title of its rows in the tables."""
+        return self.listing.title
 
     def inputs(self, case: Case) -> Inputs:
         """What the method may use of a case."""
@@ -51,63 +57,89 @@ class Method:
         return replace(
             given,
             bone_lengths_m=bone_lengths(points, names),
-            orientations=limb_orientations(case.truth.rotations, points, LIFTER_SIGMA_DEG, case.seed, names),
+            orientations=limb_orientations(case.truth.rotations, points, LIMB_SIGMA_DEG, case.seed, names),
         )
+
+
+class _Methods(Mapping[str, Method]):
+    """Computed at each look-up, so that a baseline that is registered later is found."""
+
+    def __getitem__(self, name: str) -> Method:
+        return _all_methods()[name]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(_all_methods())
+
+    def __len__(self) -> int:
+        return len(_all_methods())
+
+
+METHODS: Mapping[str, Method] = _Methods()
+"""All methods by name: the library's configurations, the baselines, and variants of both."""
 
 
 def method(name: str) -> Method:
     """A method by its name.
 
     Raises:
-        CalibrationError: if there is none of that name.
+        ConfigError: if there is no method of that name; the message lists the methods.
+
+    Example:
+        >>> method("kineo").title
+        'Kineo'
     """
-    if name not in METHODS:
-        expected = f"one of {', '.join(METHODS)}"
-        raise CalibrationError("unknown method", where="--methods", got=repr(name), expected=expected)
-    return METHODS[name]
-
-
-def _configured(inputs: Inputs, config: str) -> Estimate:
-    calibration = calibrate(inputs.observations, config)
-    return Estimate(calibration.rotations.to(torch.float64), calibration.translations.to(torch.float64), calibration.status)
-
-
-_TITLES = {
-    "default": "torchstickcal, `default`",
-    "lbfgs": "torchstickcal, `lbfgs`",
-    "paper": "torchstickcal, `paper` (the published method)",
-    "without_length": "`paper` without length constraint",
-    "without_smoothness": "`paper` without temporal smoothness",
-    "stick_only": "Stick, given length",
-    "human_height": "Human, true stature",
-    "human_guessed_low": "Human, stature - 0.1 m",
-    "human_guessed_high": "Human, stature + 0.1 m",
-    "human_only": "Human, 1.72 m for everybody",
-    "human_bones": "Human, true bone lengths",
-    "aruco_cube": "ArUco cube",
-    "calib_person": "CalibPerson",
-    "extra_calib": "ExtraCalib",
-    "kineo": "Kineo",
-    "ewand": "eWand",
-}
-_OF_A_HEIGHT = {"human_height": "Human", "calib_person": "CalibPerson", "extra_calib": "ExtraCalib", "kineo": "Kineo"}
-_PROFILED = {"default", "paper"}
+    known = _all_methods()
+    if name not in known:
+        expected = f"one of {', '.join(known)}"
+        raise ConfigError(
+            "unknown method", where="--methods", got=repr(name), expected=expected, remedy=suggestion(name, known)
+        )
+    return known[name]
 
 
 def _all_methods() -> dict[str, Method]:
-    estimates = BASELINES | {name: partial(_configured, config=name) for name in config_names()}
-    known = {name: Method(_TITLES.get(name, name), way, profiled=name in _PROFILED) for name, way in estimates.items()}
-    in_motion = {
-        f"{name}_in_motion": Method(f"{title}, true mean height in motion", BASELINES[name], height_in_motion=True)
-        for name, title in _OF_A_HEIGHT.items()
+    """The library's own configurations first, then the methods that they are compared with, by position, then variants."""
+    configured = {name: _configured(name) for name in dict.fromkeys([*LISTINGS, *config_names()])}
+    baselines = {name: Method(entry.listing, entry) for name, entry in BASELINES.items()}
+    if taken := sorted(configured.keys() & baselines.keys()):
+        raise ConfigError(
+            "a baseline has the name of a configuration",
+            where="register a baseline",
+            got=repr(taken[0]),
+            expected="another name",
+        )
+    own = {name: method for name, method in configured.items() if method.listing.position >= OWN_CONFIGURATIONS}
+    by_position = dict(sorted((configured | baselines).items(), key=lambda item: item[1].listing.position))
+    return own | by_position | _in_motion() | _shortened()
+
+
+def _configured(config: str) -> Method:
+    """The calibration with one of the library's configurations."""
+    return Method(listing_of(config), partial(_calibrated, config=config), profiled=config in PROFILED)
+
+
+def _calibrated(inputs: Inputs, config: str) -> Estimate:
+    return Estimate.of_calibration(calibrate(inputs.observations, config))
+
+
+def _in_motion() -> dict[str, Method]:
+    """The variants that are given the true mean height in motion; the paper has no figures for them."""
+    return {
+        f"{name}_in_motion": Method(
+            replace(entry.listing, title=entry.title_in_motion, tables=dict.fromkeys(entry.listing.tables), reasons=(), row=""),
+            entry,
+            height_in_motion=True,
+        )
+        for name, entry in sorted(BASELINES.items(), key=lambda item: item[1].listing.position)
+        if entry.title_in_motion
     }
-    shortened = {
-        f"default_{frames}_frames": Method(f"`default`, {frames} frames", partial(_configured, config="default"), frames=frames)
+
+
+def _shortened() -> dict[str, Method]:
+    """The default configuration on the first frames of a session."""
+    return {
+        f"default_{frames}_frames": replace(
+            _configured("default"), listing=Listing(f"`default`, {frames} frames"), frames=frames, profiled=False
+        )
         for frames in _FEW_FRAMES
     }
-    order = [*_TITLES, *sorted(known.keys() - _TITLES.keys())]
-    return {name: known[name] for name in order} | in_motion | shortened
-
-
-METHODS: dict[str, Method] = _all_methods()
-"""The methods by name."""

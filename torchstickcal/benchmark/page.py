@@ -1,4 +1,4 @@
-"""The benchmark's files: all measurements as CSV and JSON, pictures, and a page of it all in Markdown and HTML."""
+"""The files of a benchmark: all measurements as CSV and JSON, figures, and a report in Markdown and in HTML."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ figure { margin: 1rem 0; } img { max-width: 100%; } code { background: #f0f2f4; 
 
 
 def write_results(rows: Sequence[Row], out: Path) -> None:
-    """Write the CSV, the JSON, the pictures and both pages into a folder."""
+    """Write ``results.csv``, ``results.json``, the figures, ``benchmark.md`` and ``benchmark.html`` into a folder."""
     made = tables(rows)
     pictures = {name: (caption, _png(figure)) for name, (caption, figure) in figures(rows).items()}
     record = {"rows": [asdict(row) for row in rows], "tables": {table.name: asdict(table) for table in made}}
@@ -48,7 +48,7 @@ def write_results(rows: Sequence[Row], out: Path) -> None:
 
 
 def as_csv(rows: Sequence[Row]) -> str:
-    """One line for each method on each case."""
+    """CSV with one line for each method on each case."""
     text = io.StringIO()
     writer = csv.DictWriter(text, [field.name for field in fields(Row)], lineterminator="\n")
     writer.writeheader()
@@ -57,7 +57,12 @@ def as_csv(rows: Sequence[Row]) -> str:
 
 
 def markdown(rows: Sequence[Row], made: Sequence[Table], captions: Mapping[str, str]) -> str:
-    """The page in Markdown, its pictures beside it."""
+    """The report in Markdown, which refers to the files of the figures.
+
+    Args:
+        rows: all measured rows. made: the tables.
+        captions: of the figures, by name.
+    """
     parts = [f"# {_heading(rows)}", _introduction(rows)]
     for table in made:
         lines = [table.header, ["---"] + ["---:"] * (len(table.header) - 1), *table.rows]
@@ -70,7 +75,12 @@ def markdown(rows: Sequence[Row], made: Sequence[Table], captions: Mapping[str, 
 
 
 def page(rows: Sequence[Row], made: Sequence[Table], pictures: Mapping[str, tuple[str, bytes]]) -> str:
-    """The page in HTML, with nothing outside it."""
+    """The report in HTML; it contains the figures.
+
+    Args:
+        rows: all measured rows. made: the tables.
+        pictures: caption and PNG file of each figure, by name.
+    """
     parts = [f"<h1>{_marked(_heading(rows))}</h1>", f"<p>{_marked(_introduction(rows))}</p>"]
     for table in made:
         head = "".join(f"<th>{_marked(_text(cell))}</th>" for cell in table.header)
@@ -96,10 +106,11 @@ def _heading(rows: Sequence[Row]) -> str:
 
 def _introduction(rows: Sequence[Row]) -> str:
     return (
-        f"{len({row.method for row in rows})} methods on {len({row.case for row in rows})} sessions. Errors are in the paper's "
-        "measure: estimated camera centres are laid onto the true ones without scale; the angle of the rotation that is left "
-        "and the distance of the centres are averaged over the cameras of a session, then over the sessions. The paper's "
-        "figures are of its 160 sequences."
+        f"{len({row.method for row in rows})} methods on {len({row.case for row in rows})} sessions. Errors are "
+        "measured as in the paper (Yang et al., Multi-Camera Self-Calibration in Sports Motion Capture, FG 2026): a rigid "
+        "transformation without scale aligns the estimated camera centres with the true ones; the remaining rotation angle and "
+        "distance of the centres are averaged over the cameras of a session, then over the sessions. The figures of the paper "
+        "are for its 160 sequences."
     )
 
 

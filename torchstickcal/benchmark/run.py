@@ -1,4 +1,4 @@
-"""Measuring every method on every case, so that what is interrupted can go on where it was."""
+"""Measurement of every method on every case. A run that was interrupted continues where it stopped."""
 
 from __future__ import annotations
 
@@ -10,16 +10,17 @@ from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import asdict, dataclass
 from functools import lru_cache, partial
 from pathlib import Path
+from typing import NamedTuple
 
 import torch
 
 from torchstickcal.benchmark.baselines import Inputs, MissingInputError
 from torchstickcal.benchmark.bound import Bound, camera_bound
 from torchstickcal.benchmark.cases import Case, Source
-from torchstickcal.benchmark.memory import input_bytes, memory_needed
-from torchstickcal.benchmark.methods import METHODS
+from torchstickcal.benchmark.memory import Memory, input_bytes, memory_needed
+from torchstickcal.benchmark.methods import Method, method
 from torchstickcal.errors import CalibrationError, FileFormatError
-from torchstickcal.metrics import pose_errors
+from torchstickcal.metrics import PoseErrors, pose_errors
 
 ROWS_FILE = "rows.jsonl"
 CONVERGED, NOT_CONVERGED, FAILED, LACKS_INPUT = "converged", "not converged", "failed", "lacks an input"
@@ -27,9 +28,10 @@ CONVERGED, NOT_CONVERGED, FAILED, LACKS_INPUT = "converged", "not converged", "f
 
 @dataclass(frozen=True)
 class Row:
-    """A method on a case."""
+    """The measurement of one method on one case."""
 
     place: str
+    """name of the set of cases"""
     case: str
     regime: str
     cameras: int
@@ -37,54 +39,70 @@ class Row:
     noise_px: float | None
     method: str
     outcome: str
-    """``converged``, ``not converged`` (with the poses it stopped at), ``failed``, or ``lacks an input``"""
+    """``converged``, ``not converged`` (the errors are those of the last poses), ``failed``, or ``lacks an input``"""
     status: str
-    """what the method says about it"""
+    """``converged``, or why not"""
     rotation_deg: float | None
     translation_m: float | None
-    """mean camera errors, None where there is no pose of every camera"""
+    """mean errors of the cameras; None unless the pose of every camera was estimated"""
     bound_rotation_deg: float | None
     bound_translation_m: float | None
+    """Cramér-Rao bounds of the mean errors"""
     seconds: float | None
-    """of the call alone, on one thread"""
+    """run time of the method, on one thread"""
     input_bytes: int
     peak_resident_bytes: int | None
     peak_tensor_bytes: int | None
-    """what a call needs beyond its input, where it was measured"""
+    """peak memory of a call in addition to its input; None if it was not measured"""
 
 
 Progress = Callable[[int, int, str], None]
-"""Told how many of how many measurements are done, and what was the last."""
+"""Called with the number of finished measurements, the number of all, and a description of the last one."""
 
 
 def run_benchmark(
     place: str, cases: Sequence[Source], methods: Sequence[str], out: Path, jobs: int = 1, progress: Progress | None = None
 ) -> list[Row]:
-    """Measure what the folder ``out`` does not hold yet; every measurement is in its file before the next one counts.
+    """Measure methods on cases, except for what the folder ``out`` already holds.
+
+    Each measurement is written to a file in ``out`` at once, so that an interrupted run can be repeated and continues.
 
     Args:
-        place: what the cases are called together.
-        cases: where they come from; those without truth are passed over.
-        methods: their names.
-        out: the folder, made if need be.
-        jobs: processes, each with one thread.
-        progress: is told after each measurement.
+        place: name of the set of cases.
+        cases: their sources; cases without truth are skipped.
+        methods: names of the methods.
+        out: folder of the results; created if it does not exist.
+        jobs: number of processes, each with one thread. With more than one, sports and baselines of your own must be
+            registered in a module that your main script imports.
+        progress: called after each measurement.
 
     Returns:
-        The rows of these cases and methods, in their order, measured now or before.
+        The rows of these cases and methods, in their order, measured now or earlier.
 
     Raises:
-        CalibrationError: if ``out`` holds measurements of another place, or jobs are fewer than 1.
+        CalibrationError: if ``out`` holds measurements of another set of cases, for an unknown method, or if ``jobs`` is less
+            than 1.
+
+    Example:
+        >>> import pathlib, tempfile
+        >>> from torchstickcal.benchmark import run_benchmark, sources
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     cases = sources("sports-stick-syn", 1)
+        ...     rows = run_benchmark("sports-stick-syn", cases, ["default", "ewand"], pathlib.Path(folder))
+        >>> [(row.method, row.outcome, row.translation_m < 0.01) for row in rows]
+        [('default', 'converged', True), ('ewand', 'converged', True)]
     """
     if jobs < 1:
         raise CalibrationError("no process to measure in", where="--jobs", got=jobs, expected="1 or more")
+    for name in methods:
+        method(name)
     out.mkdir(parents=True, exist_ok=True)
     file = out / ROWS_FILE
     known = {(row.case, row.method): row for row in read_rows(file)}
     places = {row.place for row in known.values()} - {place}
     if places:
         raise CalibrationError(
-            "the folder holds another benchmark's results", where=str(out), got=", ".join(sorted(places)), expected=place
+            "the folder holds results of another benchmark", where=str(out), got=", ".join(sorted(places)), expected=place
         )
     wanted = [(source, name) for source in cases for name in methods]
     missing = [(source, name) for source, name in wanted if (source.name, name) not in known]
@@ -95,15 +113,15 @@ def run_benchmark(
                 stream.write(json.dumps(asdict(row)) + "\n")
                 stream.flush()
             if progress:
-                progress(done, len(wanted), f"{row.case} {row.method}" if row else "without truth")
+                progress(done, len(wanted), f"{row.case} {row.method}" if row else "skipped: no truth")
     return [known[source.name, name] for source, name in wanted if (source.name, name) in known]
 
 
 def read_rows(file: Path) -> list[Row]:
-    """The rows of a file; a last line that was cut off is removed from it.
+    """The rows of a file. An incomplete last line, of a run that was interrupted, is removed from the file.
 
     Raises:
-        FileFormatError: if another line is not a row.
+        FileFormatError: if a line is not a row.
     """
     if not file.exists():
         return []
@@ -118,33 +136,20 @@ def read_rows(file: Path) -> list[Row]:
 
 
 def measure(place: str, source: Source, name: str) -> Row | None:
-    """One method on one case; None if the case carries no truth. Whatever a method raises is its failure, not the run's."""
-    method = METHODS[name]
+    """Measure one method on one case; None if the case has no truth.
+
+    Any exception that the method raises is reported in the row.
+    """
+    measured = method(name)
     try:
-        loaded = _loaded(source, method.frames)
+        loaded = _loaded(source, measured.frames)
     except CalibrationError as error:
         return _unreadable(place, source, name, error)
     if loaded is None:
         return None
     case, bound = loaded
-    seconds = needed = errors = None
-    try:
-        inputs = method.inputs(case)
-        _warm_up(name, inputs)
-        began = time.perf_counter()
-        estimate = method.estimate(inputs)
-        seconds = time.perf_counter() - began
-        outcome, status = CONVERGED if estimate.status == "converged" else NOT_CONVERGED, estimate.status
-        truth = case.truth
-        if bool(estimate.translations.isfinite().all()):
-            errors = pose_errors(estimate.rotations, estimate.translations, truth.rotations, truth.translations)
-        else:
-            outcome = FAILED
-        needed = memory_needed(partial(method.estimate, inputs)) if method.profiled else None
-    except MissingInputError as error:
-        outcome, status = LACKS_INPUT, str(error)
-    except Exception as error:
-        outcome, status = FAILED, f"{type(error).__name__}: {error}".splitlines()[0]
+    found = _called(name, measured, case)
+    errors, needed = found.errors, found.needed
     return Row(
         place=place,
         case=case.name,
@@ -153,20 +158,52 @@ def measure(place: str, source: Source, name: str) -> Row | None:
         frames=case.observations.num_frames,
         noise_px=case.noise_px,
         method=name,
-        outcome=outcome,
-        status=status,
+        outcome=found.outcome,
+        status=found.status,
         rotation_deg=errors.mean_rotation_deg if errors else None,
         translation_m=errors.mean_translation_m if errors else None,
         bound_rotation_deg=bound.rotation_deg if bound else None,
         bound_translation_m=bound.translation_m if bound else None,
-        seconds=seconds,
+        seconds=found.seconds,
         input_bytes=input_bytes(case.observations),
         peak_resident_bytes=needed.resident_bytes if needed else None,
         peak_tensor_bytes=needed.tensor_bytes if needed else None,
     )
 
 
+class _Result(NamedTuple):
+    """The result of a call of a method: without errors if it failed."""
+
+    outcome: str
+    status: str
+    seconds: float | None = None
+    errors: PoseErrors | None = None
+    needed: Memory | None = None
+
+
+def _called(name: str, measured: Method, case: Case) -> _Result:
+    """Call a method on a case, and compare its estimate with the truth."""
+    seconds = None
+    try:
+        inputs = measured.inputs(case)
+        _warm_up(name, measured, inputs)
+        start = time.perf_counter()
+        estimate = measured.estimate(inputs)
+        seconds = time.perf_counter() - start
+        outcome, errors = FAILED, None
+        if bool(estimate.translations.isfinite().all()):
+            outcome = CONVERGED if estimate.status == "converged" else NOT_CONVERGED
+            errors = pose_errors(estimate.rotations, estimate.translations, case.truth.rotations, case.truth.translations)
+        needed = memory_needed(partial(measured.estimate, inputs)) if measured.profiled else None
+        return _Result(outcome, estimate.status, seconds, errors, needed)
+    except MissingInputError as error:
+        return _Result(LACKS_INPUT, str(error))
+    except Exception as error:
+        return _Result(FAILED, f"{type(error).__name__}: {error}".splitlines()[0], seconds)
+
+
 def _measured(place: str, missing: Sequence[tuple[Source, str]], jobs: int) -> Iterator[Row | None]:
+    """The rows of cases and methods, as they are finished."""
     if jobs == 1 or not missing:
         threads = torch.get_num_threads()
         torch.set_num_threads(1)
@@ -187,7 +224,7 @@ def _measured(place: str, missing: Sequence[tuple[Source, str]], jobs: int) -> I
 
 @lru_cache(maxsize=4)
 def _loaded(source: Source, frames: int | None) -> tuple[Case, Bound | None] | None:
-    """A case with its bound; the methods of a case come one after another."""
+    """A case with its bound; remembered, because the methods of a case are measured one after another."""
     case = source.load()
     if case is None:
         return None
@@ -198,14 +235,15 @@ def _loaded(source: Source, frames: int | None) -> tuple[Case, Bound | None] | N
 _warm: set[str] = set()
 
 
-def _warm_up(name: str, inputs: Inputs) -> None:
-    """The first call in a process pays for what is loaded and compiled; it is not timed."""
+def _warm_up(name: str, measured: Method, inputs: Inputs) -> None:
+    """Call a method once without timing it: the first call in a process loads and compiles code."""
     if name not in _warm:
-        METHODS[name].estimate(inputs)
+        measured.estimate(inputs)
         _warm.add(name)
 
 
 def _unreadable(place: str, source: Source, name: str, error: CalibrationError) -> Row:
+    """The row of a case that cannot be read."""
     unknown = dict.fromkeys(
         ("noise_px", "rotation_deg", "translation_m", "bound_rotation_deg", "bound_translation_m", "seconds"), None
     )

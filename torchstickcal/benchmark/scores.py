@@ -1,4 +1,4 @@
-"""One configuration in the paper's measure over sessions with known truth."""
+"""Errors of one configuration on sessions with known truth."""
 
 from __future__ import annotations
 
@@ -15,19 +15,27 @@ from torchstickcal.pipeline.calibrate import calibrate
 
 @dataclass(frozen=True)
 class SequenceScore:
-    """One session's errors; None where it could not be calibrated."""
+    """Errors of one session, averaged over its cameras; None if it could not be calibrated."""
 
     name: str
     rotation_deg: float | None
     translation_m: float | None
     seconds: float
+    """run time of the calibration"""
     status: str
+    """``converged``, or why not"""
 
 
 def score_sequence(source: Source, config: Config) -> SequenceScore | None:
-    """Calibrate a session and compare with its truth; None if it carries none.
+    """Calibrate a session and compare the result with the truth.
 
-    A session that cannot be read or calibrated is scored without errors, its status saying why.
+    Args:
+        source: of the session.
+        config: the configuration.
+
+    Returns:
+        The errors; None for a session without truth. If the session cannot be read or calibrated, the errors are None and the
+        status says why.
     """
     try:
         case = source.load()
@@ -42,7 +50,7 @@ def score_sequence(source: Source, config: Config) -> SequenceScore | None:
 
 
 def summarise(scores: list[SequenceScore]) -> dict[str, Any]:
-    """All scores and their means over the sessions that could be calibrated, as JSON can hold them."""
+    """All scores, and their means over the sessions that could be calibrated, as a dictionary that can be written as JSON."""
     rotations = [score.rotation_deg for score in scores if score.rotation_deg is not None]
     translations = [score.translation_m for score in scores if score.translation_m is not None]
     return {

@@ -1,16 +1,27 @@
-"""Sessions with known truth: athletes of four sports and a wand, seen by simulated cameras, with everything that goes wrong."""
+"""Simulated sessions with known truth: an athlete with a stick, cameras, and the errors of real recordings.
 
+Example:
+    >>> from torchstickcal.simulate import SPORTS, SessionSpec
+    >>> sorted(SPORTS)
+    ['baseball', 'golf', 'hockey', 'kendo', 'wand']
+    >>> session = SessionSpec("swing", sport="golf", cameras=4, frames=60).generate()
+    >>> session.observations.num_cameras
+    4
+"""
+
+from torchstickcal.simulate.athlete import Motion
 from torchstickcal.simulate.clocks import Clocks
 from torchstickcal.simulate.cube import Cube, CubeViews
-from torchstickcal.simulate.motions import ACTIONS, Motion, action
+from torchstickcal.simulate.motions import SPORTS, Action, Posture, action, tilted_plane
 from torchstickcal.simulate.presets import PRESETS, golf_session, preset, session_specs
 from torchstickcal.simulate.regimes import Noise
 from torchstickcal.simulate.rigs import Lens
 from torchstickcal.simulate.session import Assumptions, SessionSpec, SimulatedSession, read_simulated, write_simulated
 
 __all__ = [
-    "ACTIONS",
     "PRESETS",
+    "SPORTS",
+    "Action",
     "Assumptions",
     "Clocks",
     "Cube",
@@ -18,6 +29,7 @@ __all__ = [
     "Lens",
     "Motion",
     "Noise",
+    "Posture",
     "SessionSpec",
     "SimulatedSession",
     "action",
@@ -25,5 +37,6 @@ __all__ = [
     "preset",
     "read_simulated",
     "session_specs",
+    "tilted_plane",
     "write_simulated",
 ]

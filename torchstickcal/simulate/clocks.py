@@ -1,4 +1,4 @@
-"""When each camera looks: clocks that differ, and shutters that read one row after another."""
+"""Clocks and shutters of the cameras: time offsets between cameras, and rolling shutters."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from torchstickcal.simulate.motions import Motion
+from torchstickcal.simulate.athlete import Motion
 from torchstickcal.simulate.rigs import CameraRig
 
 Array = NDArray[np.float64]
@@ -18,30 +18,49 @@ _TOLERANCE_ROWS = 1e-10
 
 @dataclass(frozen=True)
 class Clocks:
-    """How far the cameras' clocks and shutters are from perfect.
+    """Time offsets between the cameras and read-out time of their rolling shutters.
 
-    Row v of an image of height h is exposed at ``frame time + time offset + readout_s * v / h``. Camera 0's offset is 0:
-    its frame times are the common clock.
+    Row v of an image of height h is exposed at ``frame time + time offset + readout_s * v / h``. The time offset of camera 0
+    is 0: its frame times are the common clock.
 
     Args:
-        offset_s: largest offset of the other cameras, which are drawn uniformly up to it, late or early.
-        readout_s: time from the first row to the last, of every camera.
+        offset_s: largest time offset, seconds; the offset of each other camera is drawn uniformly from
+            ``-offset_s`` to ``offset_s``.
+        readout_s: read-out time of every camera, from the first to the last row, seconds; 0 is a global shutter.
+
+    Example:
+        >>> Clocks(offset_s=0.1).offsets(3, np.random.default_rng(0)).round(3)
+        array([ 0.   , -0.046, -0.092])
     """
 
     offset_s: float = 0.0
     readout_s: float = 0.0
 
     def offsets(self, cameras: int, rng: np.random.Generator) -> Array:
-        """Time offsets (C,), seconds."""
+        """Draw the time offsets of the cameras.
+
+        Args:
+            cameras: their number C.
+            rng: random generator.
+
+        Returns:
+            (C,), seconds; 0 for camera 0.
+        """
         drawn = rng.uniform(-self.offset_s, self.offset_s, cameras)
         return np.where(np.arange(cameras) > 0, drawn, 0.0)
 
 
 def exposed_points(motion: Motion, rig: CameraRig, times: Array, readout_s: float) -> Array:
-    """Where each camera finds the points (C, F, P, 3) in frames that begin at times (C, F), seconds.
+    """Positions of the points when each camera exposed them, (C, F, P, 3), metres.
 
-    With a rolling shutter the row in which a point appears says when it was exposed, and that where it was: the row at
-    which both agree is found by the secant method, for all points at once.
+    With a rolling shutter the time of exposure depends on the image row of the point, and the image row on the time. The row
+    that satisfies both is found with the secant method, for all points at once.
+
+    Args:
+        motion: of the athlete and the stick.
+        rig: the cameras.
+        times: at which each camera exposes the first row of its frames, (C, F), seconds.
+        readout_s: read-out time, seconds.
     """
     points = np.stack([motion.points(camera) for camera in times])
     if readout_s == 0:
@@ -52,21 +71,22 @@ def exposed_points(motion: Motion, rig: CameraRig, times: Array, readout_s: floa
 
     def image_rows(active: NDArray[np.intp], rows: Array) -> tuple[Array, Array]:
         delay = readout_s * np.clip(rows, 0, height) / height
-        found = motion.points(times[camera[active], frame[active]] + delay)[np.arange(len(active)), point[active]]
-        return found, rig.rows(found, camera[active])
+        exposed = motion.points(times[camera[active], frame[active]] + delay)[np.arange(len(active)), point[active]]
+        return exposed, rig.rows(exposed, camera[active])
 
     active = np.arange(points[..., 0].size)
     flat = points.reshape(-1, 3)
-    before = np.zeros(len(active))
+    previous_rows = np.zeros(len(active))
     rows = rig.rows(flat, camera)
-    error_before = rows - before
+    previous_error = rows - previous_rows
     for _ in range(_ITERATIONS):
-        flat[active], seen = image_rows(active, rows)
-        error = seen - rows
-        change = error - error_before
-        step = np.where(np.abs(change) > 1e-12, -error * (rows - before) / np.where(change == 0, 1, change), error)
-        going = (np.abs(error) > _TOLERANCE_ROWS) & (np.abs(rows) < 10 * height)
-        if not going.any():
+        flat[active], projected = image_rows(active, rows)
+        error = projected - rows
+        change = error - previous_error
+        step = np.where(np.abs(change) > 1e-12, -error * (rows - previous_rows) / np.where(change == 0, 1, change), error)
+        unsolved = (np.abs(error) > _TOLERANCE_ROWS) & (np.abs(rows) < 10 * height)
+        if not unsolved.any():
             break
-        active, before, error_before, rows = active[going], rows[going], error[going], (rows + step)[going]
+        active, previous_rows, previous_error = active[unsolved], rows[unsolved], error[unsolved]
+        rows = (rows + step)[unsolved]
     return flat.reshape(points.shape)

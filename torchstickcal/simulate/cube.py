@@ -1,4 +1,4 @@
-"""A cube with a square marker on each face, seen by all cameras before the athlete comes: the classical calibration object."""
+"""A calibration object: a cube with a square marker on each face, recorded by all cameras in the empty scene."""
 
 from __future__ import annotations
 
@@ -13,17 +13,21 @@ from torchstickcal.simulate.skeleton import unit
 Array = NDArray[np.float64]
 
 _NORMALS = np.array([[1, 0, 0], [0, 1, 0], [-1, 0, 0], [0, -1, 0], [0, 0, 1], [0, 0, -1]], float)
-_GRAZING = np.cos(np.deg2rad(75))
+_MIN_COSINE = np.cos(np.deg2rad(75))
 
 
 @dataclass(frozen=True)
 class Cube:
-    """The cube.
+    """A cube in the centre of the scene with a square marker on each face.
 
     Args:
-        edge_m: its edge.
-        marker_share: edge of a marker as a share of it.
-        faces: 6 for a hanging cube, 5 for a standing one, whose lower face is not seen.
+        edge_m: edge of the cube, metres.
+        marker_share: edge of a marker as a share of the edge of the cube.
+        faces: number of faces with a marker: 6 for a hanging cube, 5 for a cube that stands on its lower face.
+
+    Example:
+        >>> Cube(edge_m=0.4).corners_m.shape
+        (24, 3)
     """
 
     edge_m: float = 0.4
@@ -32,7 +36,7 @@ class Cube:
 
     @property
     def corners_m(self) -> Array:
-        """The markers' corners (4 faces, 3) in the world, four after four, counter-clockwise seen from outside."""
+        """Corners of the markers in the world, (4 * faces, 3), metres; four per marker, counter-clockwise seen from outside."""
         half = self.edge_m / 2
         corners = []
         for normal in _NORMALS[: self.faces]:
@@ -43,23 +47,32 @@ class Cube:
         return np.array(SCENE_CENTRE) + np.array(corners)
 
     def seen_by(self, rig: CameraRig, sigma_px: float, rng: np.random.Generator) -> CubeViews:
-        """The corners in the images: of markers turned towards the camera, up to 75 degrees, and wholly in its image."""
+        """Keypoints of the corners with Gaussian noise.
+
+        A camera sees a marker if the marker is completely in the image and its normal is less than 75 degrees from the
+        direction to the camera.
+
+        Args:
+            rig: the cameras.
+            sigma_px: standard deviation of the noise along each image axis, pixels.
+            rng: random generator.
+        """
         corners = self.corners_m
         faces = corners.reshape(-1, 4, 3)
-        sight = unit(rig.centres[:, None] - faces.mean(1))
-        turned = (sight * _NORMALS[: self.faces]).sum(-1) > _GRAZING
+        to_camera = unit(rig.centres[:, None] - faces.mean(1))
+        facing = (to_camera * _NORMALS[: self.faces]).sum(-1) > _MIN_COSINE
         keypoints = rig.project(np.broadcast_to(corners, (len(rig.centres), *corners.shape)))
-        whole = np.isfinite(keypoints).reshape(len(keypoints), -1, 8).all(-1)
-        seen = np.repeat(turned & whole, 4, axis=1)
+        complete = np.isfinite(keypoints).reshape(len(keypoints), -1, 8).all(-1)
+        seen = np.repeat(facing & complete, 4, axis=1)
         keypoints = keypoints + sigma_px * rng.standard_normal(keypoints.shape)
         return CubeViews(corners, np.where(seen[..., None], keypoints, np.nan))
 
 
 @dataclass(frozen=True, eq=False)
 class CubeViews:
-    """A cube as the cameras saw it."""
+    """The keypoints of a cube."""
 
     corners_m: Array
-    """(K, 3), the corners in the world, four for each marker"""
+    """(K, 3), the corners of the markers in the world, metres; four per marker"""
     keypoints: Array
-    """(C, K, 2) pixels, NaN where not seen"""
+    """(C, K, 2), pixels; NaN where not seen"""

@@ -1,4 +1,4 @@
-"""Where the athlete goes: closed curves on the floor, and steps along them that leave no foot sliding."""
+"""Paths of the athlete on the floor: closed curves, and steps along them in which no planted foot slides."""
 
 from __future__ import annotations
 
@@ -20,14 +20,17 @@ _LIFT_M = 0.10
 
 @dataclass(frozen=True)
 class Path:
-    """A closed curve, once around for each whole number of laps, smooth in all its derivatives.
+    """A smooth closed curve on the floor around the origin.
 
-    Circle, triangle and square are the trigonometric curves ``e^(ia) + k e^(-i(n-1)a)`` whose sides are as straight as two
-    terms can make them, ``|k| = 1 / (n-1)^2``; the figure 8 is Gerono's lemniscate.
+    Circle, triangle and square are the curves ``e^(ia) + k e^(-i(n-1)a)`` with ``|k| = 1 / (n-1)^2``: rounded polygons of n
+    corners. The figure 8 is the lemniscate of Gerono.
 
     Args:
-        shape: one of :data:`PATHS`.
-        radius_m: half its longest extent, about.
+        shape: one of :data:`PATHS`; ``stay`` is the origin itself.
+        radius_m: about half the extent of the curve, metres.
+
+    Raises:
+        CalibrationError: for an unknown shape.
     """
 
     shape: str = "stay"
@@ -38,29 +41,37 @@ class Path:
             raise CalibrationError("unknown path", where="path", got=repr(self.shape), expected=f"one of {', '.join(PATHS)}")
 
     def at(self, laps: Array) -> tuple[Array, Array]:
-        """Positions (T, 2) and headings (T, 2), unit vectors, after a number of laps (T,); standing still, heading +y."""
+        """Position on the curve and direction of the curve.
+
+        Args:
+            laps: (T,), rounds since the start of the curve.
+
+        Returns:
+            Positions (T, 2) in metres and headings (T, 2), unit vectors; the heading of ``stay`` is +y.
+        """
         angle = 2 * np.pi * np.asarray(laps)
         if self.shape == "stay":
             return np.zeros((*angle.shape, 2)), np.stack([np.zeros_like(angle), np.ones_like(angle)], axis=-1)
         if self.shape == "figure8":
-            place = np.stack([np.sin(angle), np.sin(2 * angle) / 2], axis=-1)
+            position = np.stack([np.sin(angle), np.sin(2 * angle) / 2], axis=-1)
             slope = np.stack([np.cos(angle), np.cos(2 * angle)], axis=-1)
         else:
             turns = _CORNERS[self.shape] - 1
             share = (1 if self.shape == "triangle" else -1) / turns**2 if turns > 0 else 0.0
-            place = _circle(angle) + share * _circle(-turns * angle)
+            position = _circle(angle) + share * _circle(-turns * angle)
             slope = _circle(angle + np.pi / 2) - turns * share * _circle(-turns * angle + np.pi / 2)
-        return self.radius_m * place, slope / np.linalg.norm(slope, axis=-1, keepdims=True)
+        return self.radius_m * position, slope / np.linalg.norm(slope, axis=-1, keepdims=True)
 
 
 @dataclass(frozen=True)
 class Walk:
-    """Going a part of a path in every cycle of an action, between two times of the cycle, and standing otherwise.
+    """A walk along a part of a path in every repetition of an action, between two times of the repetition.
 
     Args:
         path: the path.
-        laps: how much of it in a cycle.
-        start_s: when in the cycle the walk begins. end_s: when it ends. period_s: duration of a cycle.
+        laps: part of it that is walked in each repetition, in rounds.
+        start_s: time within the repetition at which the walk starts, seconds. end_s: at which it ends.
+        period_s: duration of a repetition, seconds.
     """
 
     path: Path
@@ -70,26 +81,32 @@ class Walk:
     period_s: float
 
     def body(self, times: Array) -> tuple[Array, Array]:
-        """Position (T, 3) on the floor and rotation (T, 3, 3) of the athlete, whose forward axis y is the heading."""
+        """Position of the athlete on the floor (T, 3), metres, and rotation (T, 3, 3) from body axes to the world.
+
+        The forward axis of the body, y, is the heading.
+        """
         cycle, time = np.divmod(times, self.period_s)
-        place, heading = self.path.at(self.laps * (cycle + smoothstep((time - self.start_s) / (self.end_s - self.start_s))))
+        position, heading = self.path.at(self.laps * (cycle + smoothstep((time - self.start_s) / (self.end_s - self.start_s))))
         rotations = np.zeros((*times.shape, 3, 3))
         rotations[..., :2, 0] = np.stack([heading[..., 1], -heading[..., 0]], axis=-1)
         rotations[..., :2, 1] = heading
         rotations[..., 2, 2] = 1.0
-        return np.concatenate([place, np.zeros((*times.shape, 1))], axis=-1), rotations
+        return np.concatenate([position, np.zeros((*times.shape, 1))], axis=-1), rotations
 
     def foot(self, times: Array, stance: Array, *, leads: bool) -> Array:
-        """A foot (T, 3) whose place beside the standing body is ``stance`` (T, 3): planted, or on its way between plants.
+        """Positions of a foot (T, 3), metres: planted, or swinging from one planted position to the next.
 
-        Of two feet one leads and the other follows by half a step.
+        Args:
+            times: (T,), seconds.
+            stance: position of the foot relative to the athlete's position while standing, in body axes, (T, 3).
+            leads: whether this foot steps first; the other one follows half a step later.
         """
         begin = self.period_s * np.floor_divide(times, self.period_s)
         half = (self.end_s - self.start_s) / (2 * self._steps - 1 + 2 * _SWING_SHARE)
 
         def planted(after_s: float) -> Array:
-            place, turned = self.body(begin + after_s)
-            return place + (turned @ stance[..., None])[..., 0]
+            position, rotation = self.body(begin + after_s)
+            return position + (rotation @ stance[..., None])[..., 0]
 
         foot = before = planted(self.start_s)
         for step in range(self._steps):
@@ -104,22 +121,24 @@ class Walk:
 
     @property
     def _steps(self) -> int:
-        """Steps of each foot in a cycle."""
+        """Number of steps of each foot in a repetition."""
         ends, _ = self.path.at(np.linspace(0, self.laps, 33))
         length = np.linalg.norm(np.diff(ends, axis=0), axis=-1).sum()
         return max(1, int(np.ceil(length / (2 * _STEP_M))))
 
 
 def smoothstep(share: Array) -> Array:
-    """From 0 to 1 over [0, 1], constant outside, with continuous second derivative."""
+    """A transition from 0 to 1 over [0, 1], constant outside, with continuous second derivative."""
     s = np.clip(share, 0.0, 1.0)
     return s**3 * (10 - 15 * s + 6 * s**2)
 
 
 def _bump(share: Array) -> Array:
+    """From 0 up to 1 at 0.5 and back to 0 at 1, with continuous second derivative."""
     s = np.clip(share, 0.0, 1.0)
     return 64 * s**3 * (1 - s) ** 3
 
 
 def _circle(angle: Array) -> Array:
+    """Points (T, 2) of the unit circle at angles (T,), radians."""
     return np.stack([np.cos(angle), np.sin(angle)], axis=-1)

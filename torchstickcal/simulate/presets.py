@@ -1,4 +1,4 @@
-"""Named sets of sessions: lists of specifications, generated one by one."""
+"""Presets: named sets of session specifications. The sessions of a preset never change, so results can be compared."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from torchstickcal.io.session import Truth
 from torchstickcal.observations import Observations
 from torchstickcal.simulate.clocks import Clocks
 from torchstickcal.simulate.cube import Cube
-from torchstickcal.simulate.motions import ACTIONS
+from torchstickcal.simulate.motions import SPORTS
 from torchstickcal.simulate.regimes import (
     DetectorNoise,
     Flips,
@@ -20,21 +20,33 @@ from torchstickcal.simulate.regimes import (
     SelfOcclusion,
     SwappedEnds,
 )
-from torchstickcal.simulate.rigs import LAYOUTS, Lens
+from torchstickcal.simulate.rigs import Lens
 from torchstickcal.simulate.session import Assumptions, SessionSpec
 
 _PAPER_PATHS = {"golf": "circle", "baseball": "figure8", "hockey": "square", "kendo": "triangle"}
 _PAPER_NOISE_PX = (0.1, 0.2, 0.3, 0.4, 0.5)
 _PAPER_CAMERAS = range(3, 11)
 _PAPER_FPS = 10.0
+_PAPER_SEEDS = {"hemisphere": 0, "random": 10_000}
+_HARD_SPORTS = ("golf", "baseball", "hockey", "kendo", "wand")
+_HARD_LAYOUTS = ("hemisphere", "random", "ring", "line", "arena")
 _VIDEO = Lens(distortion=(-0.1, 0.02, 0.0005, -0.0005, 0.0))
 
 
 def preset(name: str) -> tuple[SessionSpec, ...]:
-    """The specifications of a named set.
+    """The session specifications of a preset.
+
+    Args:
+        name: a key of :data:`PRESETS`.
 
     Raises:
-        CalibrationError: if there is none of that name.
+        CalibrationError: if there is no preset of that name; the message lists the presets.
+
+    Example:
+        >>> from torchstickcal.simulate import preset
+        >>> specs = preset("hard")
+        >>> len(specs), specs[0].name, specs[0].cameras
+        (60, 'hard00_golf_hemisphere_cam2', 2)
     """
     if name not in PRESETS:
         raise CalibrationError("unknown preset", where="preset", got=repr(name), expected=f"one of {', '.join(PRESETS)}")
@@ -42,30 +54,36 @@ def preset(name: str) -> tuple[SessionSpec, ...]:
 
 
 def session_specs(name: str, count: int | None = None, seed: int = 0) -> tuple[SessionSpec, ...]:
-    """The first ``count`` sessions of a preset, by default all, or ``count`` of a sport, by default one.
+    """Session specifications of a preset or of a sport.
 
     Args:
-        name: a preset or a sport.
-        count: how many.
-        seed: added to every session's own.
+        name: a preset (a key of :data:`PRESETS`) or a sport (of :data:`~torchstickcal.simulate.SPORTS`).
+        count: number of sessions: the first ones of a preset (by default all), or sessions of a sport with consecutive seeds
+            (by default one).
+        seed: added to the seed of every session, 0 or more.
 
     Raises:
-        CalibrationError: for an unknown name, a count below 1, or a seed below 0.
+        CalibrationError: for an unknown name, a count below 1, or a negative seed.
+
+    Example:
+        >>> from torchstickcal.simulate import session_specs
+        >>> [(spec.name, spec.seed) for spec in session_specs("kendo", count=2, seed=5)]
+        [('kendo_5', 5), ('kendo_6', 6)]
     """
-    if name not in PRESETS and name not in ACTIONS:
-        known = f"a preset ({', '.join(PRESETS)}) or a sport ({', '.join(ACTIONS)})"
-        raise CalibrationError("nothing of that name to simulate", where="name", got=repr(name), expected=known)
+    if name not in PRESETS and name not in SPORTS:
+        known = f"a preset ({', '.join(PRESETS)}) or a sport ({', '.join(SPORTS)})"
+        raise CalibrationError("no preset or sport of that name", where="name", got=repr(name), expected=known)
     if count is not None and count < 1:
         raise CalibrationError("no sessions to simulate", where="count", got=count, expected="1 or more")
     if seed < 0:
-        raise CalibrationError("not a seed", where="seed", got=seed, expected="0 or more")
+        raise CalibrationError("negative seed", where="seed", got=seed, expected="0 or more")
     if name in PRESETS:
         return tuple(replace(spec, seed=spec.seed + seed) for spec in preset(name)[:count])
     return tuple(everyday(name, seed + number) for number in range(count or 1))
 
 
 def everyday(sport: str, seed: int = 0) -> SessionSpec:
-    """A sport as six cameras and a decent detector see it for some seconds."""
+    """An ordinary recording of a sport: six cameras, four seconds, the errors of a good detector."""
     return SessionSpec(
         name=f"{sport}_{seed}",
         sport=sport,
@@ -79,13 +97,17 @@ def everyday(sport: str, seed: int = 0) -> SessionSpec:
 
 
 def sports_stick_syn(layout: str = "hemisphere") -> tuple[SessionSpec, ...]:
-    """The grid of the paper's data: 4 sports, 5 noise levels, 3 to 10 cameras; 160 sessions with an ArUco cube each."""
+    """160 sessions like those of the paper's data: 4 sports, 5 noise levels, 3 to 10 cameras; each with an ArUco cube.
+
+    Args:
+        layout: ``hemisphere``, as in the paper, or ``random``.
+    """
     lens = Lens(image_size=(1200, 1200), focal_px=1600.0)
     return tuple(
         SessionSpec(
             name=f"{path}_{sport}_noise{noise:g}_cam{cameras}" + ("" if layout == "hemisphere" else f"_{layout}"),
             sport=sport,
-            seed=10_000 * LAYOUTS.index(layout) + 1000 * number + 100 * level + cameras,
+            seed=_PAPER_SEEDS[layout] + 1000 * number + 100 * level + cameras,
             cameras=cameras,
             frames=50,
             fps=_PAPER_FPS,
@@ -103,12 +125,12 @@ def sports_stick_syn(layout: str = "hemisphere") -> tuple[SessionSpec, ...]:
 
 
 def hard() -> tuple[SessionSpec, ...]:
-    """What detectors make of sports in practice: every sport and the wand on mixed rigs, much of it wrong; 60 sessions."""
+    """60 sessions with the errors of a poor detector: 4 sports and a wand, 5 layouts of 2 to 8 cameras."""
     specs = []
     for number in range(60):
-        sport = tuple(ACTIONS)[number % len(ACTIONS)]
+        sport = _HARD_SPORTS[number % len(_HARD_SPORTS)]
         cameras = (2, 3, 4, 5, 6, 8)[number // 5 % 6]
-        layout = LAYOUTS[(number + number // 5) % len(LAYOUTS)]
+        layout = _HARD_LAYOUTS[(number + number // 5) % len(_HARD_LAYOUTS)]
         share = number / 59
         specs.append(
             SessionSpec(
@@ -137,8 +159,8 @@ def hard() -> tuple[SessionSpec, ...]:
 
 
 def regimes() -> tuple[SessionSpec, ...]:
-    """Clocks and lenses: 6 cameras, 300 frames at 30, 60 and 120 Hz; each thing that can be wrong, and several at once."""
-    wrong: dict[str, tuple[Clocks, Assumptions]] = {
+    """27 sessions with errors of clocks, intrinsics or stick length, one at a time and together; 6 cameras, 300 frames."""
+    errors: dict[str, tuple[Clocks, Assumptions]] = {
         "right": (Clocks(), Assumptions()),
         "offsets": (Clocks(offset_s=0.1), Assumptions()),
         "far_offsets": (Clocks(offset_s=2.0), Assumptions()),
@@ -164,7 +186,7 @@ def regimes() -> tuple[SessionSpec, ...]:
             clocks=clocks,
             assumptions=assumptions,
         )
-        for label, (clocks, assumptions) in wrong.items()
+        for label, (clocks, assumptions) in errors.items()
         for sport, rate in (("golf", 30), ("kendo", 60), ("wand", 120))
     )
 
@@ -175,16 +197,31 @@ PRESETS = {
     "hard": hard,
     "regimes": regimes,
 }
+"""The functions that make the specifications of each preset, by name."""
 
 
 def golf_session(cameras: int = 6, frames: int = 240, noise: Noise | None = None, seed: int = 0) -> tuple[Observations, Truth]:
-    """A right-handed golf swing of 2.4 s seen by cameras on a ring of 4.5 m: a session for demonstrations and tests.
+    """A golf swing of 2.4 s, seen by cameras on a ring of radius 4.5 m: a session for demonstrations and tests.
 
     Args:
-        cameras: number of cameras.
-        frames: number of frames the swing is divided into.
-        noise: what is wrong with the keypoints; None for perfect ones.
-        seed: of everything random.
+        cameras: number of cameras C, 2 to 16.
+        frames: number of frames F into which the swing is divided.
+        noise: errors of the keypoints; None for exact keypoints.
+        seed: of all random numbers.
+
+    Returns:
+        The observations, and their truth: extrinsics, intrinsics and points (F, 21, 3).
+
+    Raises:
+        CalibrationError: for an unsupported number of cameras.
+
+    Example:
+        >>> from torchstickcal.simulate import golf_session
+        >>> observations, truth = golf_session(cameras=4, frames=30)
+        >>> observations.keypoints.shape
+        torch.Size([4, 30, 21, 2])
+        >>> truth.rotations.shape, truth.translations.shape
+        (torch.Size([4, 3, 3]), torch.Size([4, 3]))
     """
     lens = Lens(focal_px=1200.0, distortion=_VIDEO.distortion)
     spec = SessionSpec(

@@ -1,4 +1,4 @@
-"""Sessions as pictures: the athlete, the stick's trace, the cameras and the floor; and what a camera saw."""
+"""Images of simulated sessions: the scene with athlete, stick and cameras, or the keypoints of one camera."""
 
 from __future__ import annotations
 
@@ -20,10 +20,10 @@ Array = NDArray[np.float64]
 Picture = NDArray[np.uint8]
 """(H, W, 3), RGB"""
 
-_PAPER, _FLOOR, _CAMERA = (250, 250, 247), (214, 216, 212), (150, 150, 158)
+_BACKGROUND, _FLOOR, _CAMERA = (250, 250, 247), (214, 216, 212), (150, 150, 158)
 _LEFT, _RIGHT, _MIDDLE = (33, 118, 174), (210, 73, 52), (52, 56, 64)
 _STICK, _TRACE = (20, 20, 20), (232, 152, 20)
-_INKS = (_FLOOR, _CAMERA, _LEFT, _RIGHT, _MIDDLE, _STICK, _TRACE)
+_COLOURS = (_FLOOR, _CAMERA, _LEFT, _RIGHT, _MIDDLE, _STICK, _TRACE)
 _FLOOR_M, _FRUSTUM_M = 2.5, 0.28
 _SUBPIXEL_BITS = 4
 _FILM_FPS = 25
@@ -32,7 +32,7 @@ Bone = tuple[int, int, tuple[int, int, int]]
 
 
 def _bone(joint: str, parent: str) -> Bone:
-    """Its ends and colour; shoulders are drawn from the neck."""
+    """Indices of the ends of a bone and its colour; the line to a shoulder starts at the neck."""
     if joint.endswith("shoulder"):
         return JOINT_INDEX["neck"], JOINT_INDEX[joint], _MIDDLE
     colour = {"left": _LEFT, "right": _RIGHT}.get(joint.partition("_")[0], _MIDDLE)
@@ -43,12 +43,12 @@ _BONES = [_bone(joint, parent) for joint, parent in PARENTS.items()]
 
 
 class View:
-    """A drawing camera that looks at the scene.
+    """The virtual camera from which the scene is drawn; it looks at the centre of the scene.
 
     Args:
-        azimuth: from where, degrees from the x axis. elevation: above the horizon, degrees.
-        distance_m: from the scene's centre.
-        size: width and height of the pictures.
+        azimuth: of the camera, degrees from the x axis. elevation: above the horizontal, degrees.
+        distance_m: of the camera from the centre of the scene, metres.
+        size: width and height of the images, pixels.
     """
 
     def __init__(
@@ -60,13 +60,14 @@ class View:
         self._focal, self._size = 0.44 * min(size) * distance_m / 2.5, size
 
     def draw(self, points: Array, trace: Array, centres: Array, rotations: Array) -> Picture:
-        """Picture of one instant.
+        """Image of one frame.
 
         Args:
-            points: joints and stick ends, (21, 3). trace: where the stick's end has been, (K, 3), oldest first.
-            centres: camera centres (C, 3). rotations: of the cameras, world to camera, (C, 3, 3).
+            points: joints and stick ends, (21, 3), metres.
+            trace: positions of the stick's end in the preceding frames, (K, 3), oldest first.
+            centres: of the cameras, (C, 3). rotations: of the cameras, world to camera, (C, 3, 3).
         """
-        picture = np.full((self._size[1], self._size[0], 3), _PAPER, np.uint8)
+        picture = np.full((self._size[1], self._size[0], 3), _BACKGROUND, np.uint8)
         grid = np.linspace(-_FLOOR_M, _FLOOR_M, 11)
         for at in grid:
             self._line(picture, np.array([[at, -_FLOOR_M, 0], [at, _FLOOR_M, 0]]), _FLOOR, 1)
@@ -77,9 +78,9 @@ class View:
             for corner in corners:
                 self._line(picture, np.stack([centre, corner]), _CAMERA, 1)
         self._line(picture, points[[JOINT_INDEX[j] for j in ("left_ankle", "pelvis", "right_ankle")]] * [1, 1, 0], _FLOOR, 3)
-        for age, piece in enumerate(pairwise(trace), 1):
-            share = age / max(1, len(trace) - 1)
-            self._line(picture, np.stack(piece), _mixed(_TRACE, _PAPER, 0.15 + 0.85 * share), 2)
+        for number, segment in enumerate(pairwise(trace), 1):
+            share = number / max(1, len(trace) - 1)
+            self._line(picture, np.stack(segment), _mixed(_TRACE, _BACKGROUND, 0.15 + 0.85 * share), 2)
         for start, end, colour in sorted(_BONES, key=lambda bone: -self._depth(points[list(bone[:2])]).mean()):
             self._line(picture, points[[start, end]], colour, 4)
         self._line(picture, points[len(JOINTS) :], _STICK, 3)
@@ -93,8 +94,9 @@ class View:
         return (points - self._centre) @ self._rotation[2]
 
     def _pixels(self, points: Array) -> NDArray[np.int32]:
-        seen = (points - self._centre) @ self._rotation.T
-        pixels = self._focal * seen[..., :2] / np.maximum(seen[..., 2:], 0.1) + np.array(self._size) / 2
+        """Pixels (..., 2) of points (..., 3), in the fixed-point format of OpenCV's drawing functions."""
+        in_camera = (points - self._centre) @ self._rotation.T
+        pixels = self._focal * in_camera[..., :2] / np.maximum(in_camera[..., 2:], 0.1) + np.array(self._size) / 2
         return np.clip(np.round(pixels * 2**_SUBPIXEL_BITS), -(2**20), 2**20).astype(np.int32)
 
     def _line(self, picture: Picture, points: Array, colour: tuple[int, int, int], width: int) -> None:
@@ -102,7 +104,13 @@ class View:
 
 
 def scene_frames(session: SimulatedSession, view: View | None = None, trace_s: float = 0.5) -> Iterator[Picture]:
-    """The session's frames seen from outside, with the way of the stick's end in the time before each."""
+    """Images of the frames of a session, seen from outside the rig.
+
+    Args:
+        session: with true points.
+        view: from where the scene is drawn.
+        trace_s: duration of the trace of the stick's end, seconds.
+    """
     view = view or View()
     assert session.truth.points is not None
     points, rotations = session.truth.points.numpy(), session.truth.rotations.numpy()
@@ -114,13 +122,19 @@ def scene_frames(session: SimulatedSession, view: View | None = None, trace_s: f
 
 
 def camera_frames(session: SimulatedSession, camera: int, width: int = 640) -> Iterator[Picture]:
-    """The keypoints of one camera in its image: bones between those seen, gross errors ringed."""
+    """Images of the keypoints of one camera, joined by bones; outliers are circled.
+
+    Args:
+        session: any session.
+        camera: index of the camera.
+        width: of the images, pixels.
+    """
     assert session.observations.image_size is not None
     size = session.observations.image_size.expand(session.observations.num_cameras, 2)[camera].tolist()
     scale = width / size[0]
     stick = session.observations.sticks[0]
     for keypoints, inliers in zip(session.observations.keypoints[camera].numpy(), session.inliers[camera], strict=True):
-        picture = np.full((round(size[1] * scale), width, 3), _PAPER, np.uint8)
+        picture = np.full((round(size[1] * scale), width, 3), _BACKGROUND, np.uint8)
         seen = np.isfinite(keypoints).all(-1)
         pixels = np.round(np.nan_to_num(keypoints) * scale * 2**_SUBPIXEL_BITS).astype(np.int32)
         for start, end, colour in [*_BONES, (*stick.ends, _STICK)]:
@@ -133,21 +147,21 @@ def camera_frames(session: SimulatedSession, camera: int, width: int = 640) -> I
 
 
 def contact_sheet(pictures: Iterable[Picture], columns: int) -> Picture:
-    """Pictures of equal size in rows."""
-    rows = list(pictures)
-    rows += [np.full_like(rows[0], 255)] * (-len(rows) % columns)
-    return np.concatenate([np.concatenate(rows[k : k + columns], axis=1) for k in range(0, len(rows), columns)])
+    """Images of equal size arranged in rows."""
+    cells = list(pictures)
+    cells += [np.full_like(cells[0], 255)] * (-len(cells) % columns)
+    return np.concatenate([np.concatenate(cells[k : k + columns], axis=1) for k in range(0, len(cells), columns)])
 
 
 def write_film(path: str | Path, session: SimulatedSession, view: View | None = None) -> None:
-    """Write the session seen from outside as an animation in real time, of at most 25 pictures a second."""
+    """Write the session, seen from outside the rig, as an animated GIF in real time with at most 25 images per second."""
     every = max(1, round(session.fps / _FILM_FPS))
     write_gif(path, islice(scene_frames(session, view), 0, None, every), session.fps / every)
 
 
 def write_gif(path: str | Path, pictures: Iterable[Picture], fps: float) -> None:
-    """Write an animation that repeats. GIF counts hundredths of a second: at most 50 frames per second."""
-    shades = [_mixed(ink, _PAPER, share) for ink in _INKS for share in np.linspace(0, 1, 16)]
+    """Write images as an animated GIF that repeats, with at most 50 images per second."""
+    shades = [_mixed(colour, _BACKGROUND, share) for colour in _COLOURS for share in np.linspace(0, 1, 16)]
     palette = Image.new("P", (1, 1))
     palette.putpalette(np.array(shades, dtype=np.uint8).tobytes())
     first, *rest = (Image.fromarray(picture).quantize(palette=palette, dither=Image.Dither.NONE) for picture in pictures)
@@ -157,7 +171,7 @@ def write_gif(path: str | Path, pictures: Iterable[Picture], fps: float) -> None
 
 
 def write_png(path: str | Path, picture: Picture) -> None:
-    """Write one picture."""
+    """Write one image as a PNG file."""
     with atomic_path(path) as temporary:
         Image.fromarray(picture).save(temporary, format="PNG")
 

@@ -1,4 +1,4 @@
-"""Rigs of cameras around the action: where they stand and which lenses they carry."""
+"""Camera rigs around the scene: layouts of the cameras, and their lenses."""
 
 from __future__ import annotations
 
@@ -17,22 +17,29 @@ Array = NDArray[np.float64]
 LAYOUTS = ("hemisphere", "random", "ring", "line", "arena")
 SCENE_CENTRE = (0.0, 0.0, 0.9)
 _GOLDEN_ANGLE = np.pi * (3 - np.sqrt(5))
-_LOWEST_M = 0.35
+_MIN_HEIGHT_M = 0.35
 _ARENA_M = (12.0, 9.0, 3.2)
-_NEAR_M = 0.1
+_NEAR_PLANE_M = 0.1
 
 
 @dataclass(frozen=True)
 class Lens:
-    """The cameras' intrinsics.
+    """Intrinsics of the cameras.
 
     Args:
         image_size: width and height, pixels.
-        focal_px: focal length; None for that at which a ball of ``scene_m`` around the scene's centre fills the image.
-        scene_m: radius of that ball.
-        distortion: OpenCV's k1 k2 p1 p2 k3; None for perfect lenses.
-        variation: by which focal lengths, principal points and k1 differ between cameras, as a share of the focal length
-            and of k1; 0 where all are alike.
+        focal_px: focal length, pixels; None to choose it for each camera so that a ball around the centre of the scene
+            fills the image.
+        scene_m: radius of that ball, metres.
+        distortion: k1, k2, p1, p2, k3 of OpenCV's model; None for no distortion.
+        variation: differences between the cameras: relative standard deviation of focal length and k1, and standard
+            deviation of the principal point, which is 0.3 times this share of the focal length. 0: all cameras are equal.
+
+    Example:
+        >>> from torchstickcal.simulate import Lens, SessionSpec
+        >>> spec = SessionSpec("golf", "golf", frames=5, lens=Lens(image_size=(1280, 720), focal_px=900.0))
+        >>> spec.generate().observations.intrinsics[0].tolist()
+        [[900.0, 0.0, 640.0], [0.0, 900.0, 360.0], [0.0, 0.0, 1.0]]
     """
 
     image_size: tuple[int, int] = (1920, 1080)
@@ -44,7 +51,7 @@ class Lens:
 
 @dataclass(frozen=True, eq=False)
 class CameraRig:
-    """Cameras with everything about them known."""
+    """True extrinsics and intrinsics of the cameras."""
 
     rotations: Array
     """(C, 3, 3), world to camera"""
@@ -53,8 +60,9 @@ class CameraRig:
     intrinsics: Array
     """(C, 3, 3), pixels"""
     distortion: Array | None
-    """(C, 5)"""
+    """(C, 5), coefficients of OpenCV's model"""
     image_size: tuple[int, int]
+    """width and height, pixels"""
 
     @property
     def centres(self) -> Array:
@@ -62,20 +70,35 @@ class CameraRig:
         return -(self.rotations.swapaxes(1, 2) @ self.translations[..., None])[..., 0]
 
     def project(self, points: Array) -> Array:
-        """Pixels (C, ..., 2) of points (C, ..., 3), each camera seeing its own; NaN behind it and beyond its image."""
+        """Project points into the images.
+
+        Args:
+            points: of each camera, (C, ..., 3), metres.
+
+        Returns:
+            Pixels (C, ..., 2); NaN for points behind the camera or outside its image.
+        """
         in_cameras = points.reshape(len(points), -1, 3) @ self.rotations.swapaxes(1, 2) + self.translations[:, None]
         pixels = self._lenses(slice(None)).project(torch.from_numpy(in_cameras)).numpy()
-        seen = (in_cameras[..., 2] > _NEAR_M) & self.contains(pixels)
+        seen = (in_cameras[..., 2] > _NEAR_PLANE_M) & self.contains(pixels)
         return np.where(seen[..., None], pixels, np.nan).reshape(*points.shape[:-1], 2)
 
     def contains(self, pixels: Array) -> NDArray[np.bool_]:
-        """Whether pixels (..., 2) are in the image; NaN is not."""
+        """Whether pixels (..., 2) are in the image, (...); False for NaN."""
         return np.all((pixels >= 0) & (pixels <= np.array(self.image_size) - 1.0), axis=-1)
 
     def rows(self, points: Array, cameras: NDArray[np.intp]) -> Array:
-        """Image rows (N,) of points (N, 3), each in a camera of its own (N,), also beyond the image."""
+        """Image rows of points, not limited to the image.
+
+        Args:
+            points: (N, 3), metres.
+            cameras: index of the camera of each point, (N,).
+
+        Returns:
+            (N,), pixels.
+        """
         in_cameras = (self.rotations[cameras] @ points[..., None])[..., 0] + self.translations[cameras]
-        in_cameras[:, 2] = np.maximum(in_cameras[:, 2], _NEAR_M)
+        in_cameras[:, 2] = np.maximum(in_cameras[:, 2], _NEAR_PLANE_M)
         return self._lenses(cameras.tolist()).project(torch.from_numpy(in_cameras)).numpy()[..., 1]
 
     def _lenses(self, cameras: slice | list[int]) -> Intrinsics:
@@ -84,24 +107,24 @@ class CameraRig:
 
 
 def camera_rig(layout: str, count: int, rng: np.random.Generator, lens: Lens | None = None, radius_m: float = 4.0) -> CameraRig:
-    """Cameras that look at the scene's centre.
+    """A rig of cameras that look at the centre of the scene.
 
     Args:
-        layout: ``hemisphere``: spread evenly over it from above to the side, in order; ``random``: anywhere on it;
-            ``ring``: around the scene, about evenly, at alternating heights; ``line``: side by side; ``arena``: in and
-            between the upper corners of a hall of 12 x 9 m.
-        count: 2 to 16 cameras.
-        rng: for random places and varied lenses.
-        lens: what they carry.
-        radius_m: their distance from the scene's centre (not in the arena).
+        layout: one of :data:`LAYOUTS`. ``hemisphere``: spread evenly over a hemisphere, from its top downwards; ``random``:
+            at random positions on a hemisphere; ``ring``: around the scene at alternating heights; ``line``: in a row on
+            one side; ``arena``: in the upper corners of a hall of 12 x 9 m and along its walls.
+        count: number of cameras, 2 to 16.
+        rng: random generator of positions and lenses.
+        lens: intrinsics of the cameras; None for the default ones.
+        radius_m: distance of the cameras from the centre of the scene, metres; not used by ``arena``.
 
     Raises:
-        CalibrationError: for an unknown layout or another number of cameras.
+        CalibrationError: for an unknown layout or an unsupported number of cameras.
     """
     if layout not in LAYOUTS:
         raise CalibrationError("unknown layout", where="layout", got=repr(layout), expected=f"one of {', '.join(LAYOUTS)}")
     if not 2 <= count <= 16:
-        raise CalibrationError("not a number of cameras", where="cameras", got=count, expected="2 to 16")
+        raise CalibrationError("unsupported number of cameras", where="cameras", got=count, expected="2 to 16")
     centres = _centres(layout, count, rng, radius_m)
     rotations = look_at(centres, np.array(SCENE_CENTRE))
     intrinsics, distortion = _drawn_lenses(lens or Lens(), np.linalg.norm(centres - SCENE_CENTRE, axis=-1), rng)
@@ -110,13 +133,18 @@ def camera_rig(layout: str, count: int, rng: np.random.Generator, lens: Lens | N
 
 
 def look_at(centres: Array, target: Array) -> Array:
-    """Rotations (C, 3, 3), world to camera, of upright cameras at (C, 3) that look at a point (3,)."""
+    """Rotations (C, 3, 3), world to camera, of upright cameras that look at a target.
+
+    Args:
+        centres: of the cameras, (C, 3). target: (3,).
+    """
     forward = unit(target - centres)
     right = unit(np.cross(forward, [0.0, 0.0, 1.0]))
     return np.stack([right, np.cross(forward, right), forward], axis=-2)
 
 
 def _centres(layout: str, count: int, rng: np.random.Generator, radius_m: float) -> Array:
+    """Camera centres (C, 3) of a layout, metres."""
     number = np.arange(count)
     if layout == "hemisphere":
         return _on_sphere(_GOLDEN_ANGLE * number, 1 - (number + 0.5) / count, radius_m)
@@ -136,14 +164,20 @@ def _centres(layout: str, count: int, rng: np.random.Generator, radius_m: float)
     return np.concatenate([corners, rng.uniform(0.8 * height, height, (count, 1))], axis=-1)
 
 
-def _on_sphere(azimuth: Array, rise: Array, radius_m: float) -> Array:
-    """Points on a sphere around the scene's centre; ``rise`` is the sine of their elevation, kept off the floor."""
-    rise = np.maximum(rise, (_LOWEST_M - SCENE_CENTRE[2]) / radius_m)
-    across = np.sqrt(1 - rise**2)
-    return np.array(SCENE_CENTRE) + radius_m * np.stack([across * np.cos(azimuth), across * np.sin(azimuth), rise], axis=-1)
+def _on_sphere(azimuth: Array, sine: Array, radius_m: float) -> Array:
+    """Points (C, 3) on a sphere around the centre of the scene, at a minimum height above the floor.
+
+    Args:
+        azimuth: (C,), radians. sine: of the elevation, (C,).
+        radius_m: of the sphere, metres.
+    """
+    sine = np.maximum(sine, (_MIN_HEIGHT_M - SCENE_CENTRE[2]) / radius_m)
+    cosine = np.sqrt(1 - sine**2)
+    return np.array(SCENE_CENTRE) + radius_m * np.stack([cosine * np.cos(azimuth), cosine * np.sin(azimuth), sine], axis=-1)
 
 
 def _drawn_lenses(lens: Lens, distances: Array, rng: np.random.Generator) -> tuple[Array, Array | None]:
+    """Draw camera matrices (C, 3, 3) and distortion (C, 5) of cameras at distances (C,) from the centre of the scene."""
     count, size = len(distances), np.array(lens.image_size, float)
     focal = 0.5 * size.min() * distances / lens.scene_m if lens.focal_px is None else np.full(count, float(lens.focal_px))
     focal = focal * (1 + lens.variation * rng.standard_normal(count))

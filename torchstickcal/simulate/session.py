@@ -1,4 +1,4 @@
-"""A simulated session: from its specification to observations, truth, and what a benchmark wants to know besides."""
+"""Simulated sessions: a specification generates the observations together with their true values; files of sessions."""
 
 from __future__ import annotations
 
@@ -13,9 +13,10 @@ from numpy.typing import NDArray
 from torchstickcal.errors import FileFormatError
 from torchstickcal.io.session import Truth, read_npz, write_npz
 from torchstickcal.observations import Observations, Stick
+from torchstickcal.simulate.athlete import Motion
 from torchstickcal.simulate.clocks import Clocks, exposed_points
 from torchstickcal.simulate.cube import Cube, CubeViews
-from torchstickcal.simulate.motions import Motion, action
+from torchstickcal.simulate.motions import action
 from torchstickcal.simulate.paths import Path
 from torchstickcal.simulate.regimes import Regime, Views, apply
 from torchstickcal.simulate.rigs import CameraRig, Lens, camera_rig
@@ -26,14 +27,14 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Assumptions:
-    """What is told about lenses and stick, as far as it is wrong.
+    """Errors of the intrinsics and of the stick length that the observations carry.
 
     Args:
-        focal_scale: given over true focal length, of all cameras.
-        focal_spread: standard deviation of a further such factor of each camera.
-        centre_px: standard deviation of the given principal points along each axis.
-        lens_known: whether the distortion is given.
-        stick_scale: given over true length of the stick.
+        focal_scale: given divided by true focal length, the same for all cameras.
+        focal_spread: relative standard deviation of a further error of each camera's focal length.
+        centre_px: standard deviation of the error of the principal points along each image axis, pixels.
+        lens_known: whether the true distortion is given; if not, no distortion is given.
+        stick_scale: given divided by true length of the stick.
     """
 
     focal_scale: float = 1.0
@@ -43,43 +44,69 @@ class Assumptions:
     stick_scale: float = 1.0
 
     def intrinsics(self, rig: CameraRig, rng: np.random.Generator) -> tuple[Array, Array | None]:
-        """Camera matrices (C, 3, 3) and distortion (C, 5) as they are told."""
-        told = rig.intrinsics.copy()
-        told[:, [0, 1], [0, 1]] *= (self.focal_scale * (1 + self.focal_spread * rng.standard_normal(len(told))))[:, None]
-        told[:, :2, 2] += self.centre_px * rng.standard_normal((len(told), 2))
-        return told, rig.distortion if self.lens_known else None
+        """Draw the given camera matrices (C, 3, 3) and distortion (C, 5)."""
+        given = rig.intrinsics.copy()
+        given[:, [0, 1], [0, 1]] *= (self.focal_scale * (1 + self.focal_spread * rng.standard_normal(len(given))))[:, None]
+        given[:, :2, 2] += self.centre_px * rng.standard_normal((len(given), 2))
+        return given, rig.distortion if self.lens_known else None
 
 
 @dataclass(frozen=True, eq=False)
 class SimulatedSession:
-    """What the cameras observed, the truth, and how the keypoints came about."""
+    """A session with its true values."""
 
     name: str
     observations: Observations
+    """what a calibration is given"""
     truth: Truth
+    """true extrinsics, intrinsics, points, time offsets and read-out times"""
     inliers: NDArray[np.bool_]
-    """(C, F, P), False where a keypoint was drawn with a gross error"""
+    """(C, F, P), False for outliers"""
     sigma_px: Array
-    """(C, F, P), standard deviation along each axis that a keypoint was drawn with"""
+    """(C, F, P), standard deviation of the noise along each image axis, pixels"""
     cube: CubeViews | None
+    """keypoints of a calibration cube, if the specification has one"""
     height_m: float
-    """of the athlete, standing"""
+    """standing height of the athlete"""
     fps: float
+    """frames per second"""
 
 
 @dataclass(frozen=True)
 class SessionSpec:
-    """Everything that makes a session; the same specification generates the same bytes.
+    """Specification of a simulated session. The same specification always generates the same session.
 
     Args:
-        name: of the session. sport: one of the actions. seed: of everything random.
-        cameras: their number. layout, lens, radius_m: as :func:`~torchstickcal.simulate.rigs.camera_rig` takes them.
-        frames, fps: of camera 0, whose frame times are the common clock.
-        path, path_m: its shape and radius. laps: how far the athlete goes around it after each action.
-        tempo, variation: of the action. height_m: of the athlete.
-        regimes: what goes wrong with the keypoints, one after another.
-        clocks: what is wrong with the cameras' times. assumptions: what is wrong with what is known.
-        cube: a calibration object that the cameras saw too.
+        name: of the session.
+        sport: name of a sport in :data:`~torchstickcal.simulate.SPORTS`.
+        seed: of all random numbers, 0 or more.
+        cameras: number of cameras, 2 to 16.
+        frames: number of frames.
+        fps: frames per second.
+        layout: arrangement of the cameras, see :func:`~torchstickcal.simulate.rigs.camera_rig`.
+        lens: intrinsics of the cameras.
+        radius_m: distance of the cameras from the centre of the scene, metres.
+        path: shape of the athlete's path on the floor: ``stay``, ``circle``, ``square``, ``triangle`` or ``figure8``.
+        path_m: about half the extent of the path, metres.
+        laps: part of the path that the athlete walks after each repetition of the action, in rounds.
+        tempo: speed of the action; 1 is the speed of competition.
+        variation: factor on the random variation between repetitions; 0 is none.
+        height_m: standing height of the athlete, metres.
+        regimes: errors of the keypoints (see :mod:`torchstickcal.simulate.regimes`), added one after another.
+        clocks: time offsets and read-out time of the cameras.
+        assumptions: errors of the given intrinsics and stick length.
+        cube: a calibration cube that all cameras see too; None for none.
+
+    Example:
+        >>> from torchstickcal.simulate import Noise, SessionSpec
+        >>> spec = SessionSpec("serve", "baseball", seed=1, cameras=4, frames=30, regimes=(Noise(sigma_px=1.0),))
+        >>> session = spec.generate()
+        >>> session.observations.keypoints.shape  # cameras, frames, points, image axes
+        torch.Size([4, 30, 21, 2])
+        >>> session.truth.points.shape
+        torch.Size([30, 21, 3])
+        >>> session.observations.sticks[0].length_m
+        0.86
     """
 
     name: str
@@ -104,36 +131,39 @@ class SessionSpec:
 
     @property
     def motion(self) -> Motion:
-        """The athlete's motion."""
-        done = action(self.sport)
+        """The motion of the athlete and the stick.
+
+        Raises:
+            CalibrationError: for an unknown sport or path, or an impossible height.
+        """
         path = Path(self.path, self.path_m)
-        return Motion(done, Skeleton(self.height_m), path, self.laps, self.tempo, self.variation, self.seed)
+        return Motion(action(self.sport), Skeleton(self.height_m), path, self.laps, self.tempo, self.variation, self.seed)
 
     def generate(self) -> SimulatedSession:
-        """The session.
+        """Generate the session.
 
         Raises:
             CalibrationError: for an unknown sport, path or layout, or an impossible number of cameras or height.
-            ObservationError: if so little is left of the keypoints that the stick is never seen by two cameras.
+            ObservationError: if no frame is left in which two cameras see the stick.
         """
-        rng_rig, rng_clocks, rng_told, rng_keypoints, rng_cube = np.random.default_rng(self.seed).spawn(5)
+        rng_rig, rng_clocks, rng_assumptions, rng_keypoints, rng_cube = np.random.default_rng(self.seed).spawn(5)
         motion = self.motion
         rig = camera_rig(self.layout, self.cameras, rng_rig, self.lens, self.radius_m)
         times = np.arange(self.frames) / self.fps
         offsets = self.clocks.offsets(self.cameras, rng_clocks)
-        seen_at = exposed_points(motion, rig, times + offsets[:, None], self.clocks.readout_s)
-        shape = seen_at.shape[:3]
-        views = Views(rig, seen_at, rig.project(seen_at), np.ones(shape, dtype=bool), np.zeros(shape))
+        points = exposed_points(motion, rig, times + offsets[:, None], self.clocks.readout_s)
+        shape = points.shape[:3]
+        views = Views(rig, points, rig.project(points), np.ones(shape, dtype=bool), np.zeros(shape))
         views = apply(self.regimes, views, rng_keypoints)
         views = views.hiding(~rig.contains(views.keypoints))
 
-        told, told_distortion = self.assumptions.intrinsics(rig, rng_told)
+        intrinsics, distortion = self.assumptions.intrinsics(rig, rng_assumptions)
         stick = Stick(len(JOINTS), len(JOINTS) + 1, motion.action.stick_m * self.assumptions.stick_scale)
         observations = Observations(
             views.keypoints,
-            told,
+            intrinsics,
             stick,
-            distortion=told_distortion,
+            distortion=distortion,
             confidence=views.confidence,
             image_size=rig.image_size,
             fps=self.fps,
@@ -154,7 +184,24 @@ class SessionSpec:
 
 
 def write_simulated(path: str | FilePath, session: SimulatedSession) -> None:
-    """Write a session for :func:`read_simulated`; to :func:`~torchstickcal.io.read_session` it is a session with truth."""
+    """Write a simulated session to a file.
+
+    :func:`read_simulated` reads it back; :func:`~torchstickcal.io.read_session` reads its observations and truth.
+
+    Args:
+        path: of the file, ending in ``.npz``.
+        session: the session.
+
+    Example:
+        >>> import tempfile
+        >>> from torchstickcal.simulate import SessionSpec, read_simulated, write_simulated
+        >>> session = SessionSpec("cut", "kendo", cameras=3, frames=10).generate()
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     write_simulated(f"{folder}/cut.npz", session)
+        ...     back = read_simulated(f"{folder}/cut.npz")
+        >>> back.name, back.fps, back.inliers.shape
+        ('cut', 60.0, (3, 10, 21))
+    """
     more: dict[str, Any] = {
         "name": np.array(session.name),
         "inliers": session.inliers,
@@ -167,10 +214,13 @@ def write_simulated(path: str | FilePath, session: SimulatedSession) -> None:
 
 
 def read_simulated(path: str | FilePath) -> SimulatedSession:
-    """Read a session that :func:`write_simulated` wrote.
+    """Read a simulated session from a file that :func:`write_simulated` wrote (see there for an example).
+
+    Args:
+        path: of the file.
 
     Raises:
-        FileFormatError: if it is damaged or no simulated session.
+        FileFormatError: if the file is damaged or does not hold a simulated session.
     """
     observations, truth = read_npz(path)
     with np.load(path, allow_pickle=False) as file:

@@ -1,6 +1,6 @@
-"""The athlete's body: 19 joints on bones of constant length, posed by joint rotations and by reaching.
+"""The athlete's body: 19 joints connected by bones of constant length, posed by joint rotations and inverse kinematics.
 
-Body axes at rest: x to the athlete's right, y forward, z up, the feet on z = 0.
+Body axes: x to the athlete's right, y forward, z up, the soles on z = 0. The rest pose stands upright with hanging arms.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ PARENTS = {
         ("ankle", "shin"),
     )
 }
-"""The joint each joint hangs from. The pelvis is the root; a thigh runs from the pelvis itself, for there are no hip joints."""
+"""The parent of each joint. The pelvis is the root; there are no hip joints, so a thigh starts at the pelvis."""
 
 _REST = {
     "pelvis": (0.0, 0.0, 0.530),
@@ -55,26 +55,34 @@ _REST = {
     "shin": (0.0, 0.0, -0.120),
     "ankle": (0.0, 0.0, -0.126),
 }
-"""From parent to joint, standing with hanging arms, in body heights; of the right side where there are two."""
+"""Vector from the parent to the joint in the rest pose, in body heights; for paired joints that of the right side."""
 
 
 @dataclass(frozen=True)
 class Skeleton:
-    """Bones of an athlete of given standing height, in the usual proportions of adults.
+    """Bones of an athlete of given height, in the usual proportions of adults.
 
     Args:
-        height_m: from the floor to ``head_top``.
+        height_m: standing height, from the floor to ``head_top``, metres.
+
+    Raises:
+        CalibrationError: if the height is not that of a person (0.5 to 2.5 m).
     """
 
     height_m: float = STANDING_HEIGHT_M
 
     def __post_init__(self) -> None:
         if not 0.5 <= self.height_m <= 2.5:
-            raise CalibrationError("not a person's height", where="height_m", got=self.height_m, expected="0.5 to 2.5 metres")
+            raise CalibrationError(
+                "not the height of a person",
+                where="height_m",
+                got=self.height_m,
+                expected="0.5 to 2.5 metres",
+            )
 
     @cached_property
     def offsets_m(self) -> Array:
-        """From parent to joint at rest, (19, 3); for the pelvis, from the floor."""
+        """Vectors from parent to joint in the rest pose (19, 3), metres; for the pelvis, from the floor."""
         rows = []
         for joint in JOINTS:
             x, y, z = _REST[joint.removeprefix("left_").removeprefix("right_")]
@@ -82,73 +90,86 @@ class Skeleton:
         return self.height_m * np.array(rows)
 
     def bone_m(self, joint: str) -> float:
-        """Length of the bone that ends in a joint."""
+        """Length of the bone from the parent of a joint to the joint, metres."""
         return float(np.linalg.norm(self.offsets_m[JOINT_INDEX[joint]]))
 
     @property
     def thigh_m(self) -> float:
-        """Pelvis to knee."""
+        """Length from pelvis to knee, metres."""
         return self.bone_m("right_knee")
 
     @property
     def shank_m(self) -> float:
-        """Knee to ankle, straight through the shin."""
+        """Length from knee to ankle, in a straight line through the shin, metres."""
         return self.bone_m("right_shin") + self.bone_m("right_ankle")
 
     @property
     def upper_arm_m(self) -> float:
-        """Shoulder to elbow."""
+        """Length from shoulder to elbow, metres."""
         return self.bone_m("right_elbow")
 
     @property
     def forearm_m(self) -> float:
-        """Elbow to wrist."""
+        """Length from elbow to wrist, metres."""
         return self.bone_m("right_wrist")
 
     @property
     def hand_m(self) -> float:
-        """Wrist to hand."""
+        """Length from wrist to hand, metres."""
         return self.bone_m("right_hand")
 
     @property
     def ankle_height_m(self) -> float:
-        """Of an ankle above the sole."""
+        """Height of an ankle above the sole, metres."""
         return float(
             sum(self.offsets_m[JOINT_INDEX[joint], 2] for joint in ("pelvis", "right_knee", "right_shin", "right_ankle"))
         )
 
     def forward(self, pelvis: Array, rotations: Array) -> Array:
-        """Joints (T, 19, 3) of a pelvis at (T, 3) and joint rotations (T, 19, 3, 3).
+        """Forward kinematics.
 
-        A joint's rotation turns everything that hangs from it, relative to its parent's frame at rest.
+        Args:
+            pelvis: positions (T, 3), metres.
+            rotations: of each joint relative to its parent, (T, 19, 3, 3); that of the pelvis is from body to world.
+
+        Returns:
+            Positions of the joints (T, 19, 3), metres.
         """
         points = np.empty((*pelvis.shape[:-1], len(JOINTS), 3))
-        turned = np.empty_like(rotations)
-        points[:, 0], turned[:, 0] = pelvis, rotations[:, 0]
+        to_world = np.empty_like(rotations)
+        points[:, 0], to_world[:, 0] = pelvis, rotations[:, 0]
         for joint, name in enumerate(JOINTS[1:], 1):
             parent = JOINT_INDEX[PARENTS[name]]
-            points[:, joint] = points[:, parent] + turned[:, parent] @ self.offsets_m[joint]
-            turned[:, joint] = turned[:, parent] @ rotations[:, joint]
+            points[:, joint] = points[:, parent] + to_world[:, parent] @ self.offsets_m[joint]
+            to_world[:, joint] = to_world[:, parent] @ rotations[:, joint]
         return points
 
 
 def bend(root: Array, goal: Array, first_m: float, second_m: float, towards: Array) -> Array:
-    """The middle joint (T, 3) of a limb of two bones from a root to a goal, (T, 3) each.
+    """Inverse kinematics of a limb of two bones: the position of its middle joint (knee or elbow).
 
-    The law of cosines places it on a circle about the line from root to goal; ``towards`` (T, 3) picks the point on it.
+    By the law of cosines the middle joint is on a circle around the line from root to goal.
+
+    Args:
+        root: (T, 3), pelvis or shoulder. goal: (T, 3), ankle or wrist.
+        first_m: length of the bone at the root, metres. second_m: of the bone at the goal.
+        towards: direction (T, 3) in which the middle joint points; it selects the point of the circle.
+
+    Returns:
+        Positions (T, 3).
 
     Raises:
-        CalibrationError: if the goal is out of reach.
+        CalibrationError: if the goal is too far from the root, or too close to it.
     """
     line = goal - root
     distance = np.linalg.norm(line, axis=-1, keepdims=True)
     cosine = (first_m**2 + distance**2 - second_m**2) / (2 * first_m * distance)
     if not (np.abs(cosine) <= 1).all():
         raise CalibrationError(
-            "a limb cannot reach",
-            where="bend",
+            "a hand or foot of the simulated athlete is out of reach",
+            where="key postures",
             got=f"{distance.min():.3f} to {distance.max():.3f} m",
-            expected=f"{abs(first_m - second_m):.3f} to {first_m + second_m:.3f} m from root to goal",
+            expected=f"{abs(first_m - second_m):.3f} to {first_m + second_m:.3f} m from shoulder to wrist or pelvis to ankle",
         )
     along = line / distance
     side = unit(towards - (towards * along).sum(-1, keepdims=True) * along)
@@ -161,7 +182,7 @@ def unit(vectors: Array) -> Array:
 
 
 def rotation(axis: int, degrees: Array) -> Array:
-    """Rotations (T, 3, 3) about a coordinate axis by angles (T,)."""
+    """Rotations (T, 3, 3) about a coordinate axis (0, 1 or 2) by angles (T,)."""
     cosine, sine = np.cos(np.deg2rad(degrees)), np.sin(np.deg2rad(degrees))
     first, second = (axis + 1) % 3, (axis + 2) % 3
     matrices = np.zeros((*np.shape(degrees), 3, 3))

@@ -1,4 +1,4 @@
-"""One static ArUco cube in the middle of the scene, as ArucoCalib and CALICO use it (Tabb and Medeiros, 2019)."""
+"""A static cube with ArUco markers in the centre of the scene, as ArucoCalib and CALICO use it (Tabb and Medeiros, 2019)."""
 
 from __future__ import annotations
 
@@ -6,28 +6,34 @@ import cv2
 import numpy as np
 import torch
 
-from torchstickcal.benchmark.baselines.base import Array, Estimate, Inputs, required
+from torchstickcal.benchmark.baselines.base import Array, Estimate, Inputs, Listing, PublishedErrors, baseline, required
 from torchstickcal.simulate import CubeViews
 
 _MIN_CORNERS = 4
-_FLAT = 1e-6
+_PLANAR = 1e-6
 _REFINEMENT = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_COUNT, 100, 1e-14)
+_CUBE_SIZE = (
+    "The paper does not give the size of its cube; here its edge is 0.4 m. With 0.6, 1.0 and 1.2 m the errors are 0.229, 0.116 "
+    "and 0.089 degrees, and 10.5, 5.3 and 4.1 mm."
+)
 
 
+@baseline(
+    "aruco_cube",
+    Listing("ArUco cube", {"sota": PublishedErrors(0.087, 0.007)}, (_CUBE_SIZE,), position=20),
+    needs=("cube",),
+)
 def aruco_cube(inputs: Inputs) -> Estimate:
-    """Every camera's pose from the corners of the cube that it sees.
+    """Pose of each camera from the corners of the cube that it sees.
 
-    A first pose by perspective-n-point, then the least reprojection error. All cameras look at the same cube of known
-    geometry and its frame is the world's, so their joint adjustment falls apart into one refinement per camera.
+    Perspective-n-point, then minimisation of the reprojection error. The geometry of the cube is known and defines the world
+    frame, so each camera can be refined on its own.
 
     Args:
         inputs: needs ``cube``.
 
     Returns:
-        The estimate; a camera that sees fewer than four corners has a pose of NaN and is named by the status.
-
-    Raises:
-        MissingInputError: if the cube is not given.
+        The estimate. A camera that sees fewer than four corners has a pose of NaN, and the status names it.
     """
     cube: CubeViews = required(inputs, "cube")
     observations = inputs.observations
@@ -46,9 +52,12 @@ def aruco_cube(inputs: Inputs) -> Estimate:
 
 
 def _pose(corners: Array, image: Array) -> tuple[Array, Array]:
-    """Rotation and translation, cube to camera; a single face allows two poses, of which the better one is taken."""
+    """Rotation (3, 3) and translation (3,) from cube to camera, of corners (K, 3) and their normalised image points (K, 2).
+
+    The corners of a single face allow two poses; the one with the smaller reprojection error is returned.
+    """
     spread = np.linalg.svd(corners - corners.mean(0), compute_uv=False)
-    method = cv2.SOLVEPNP_IPPE if spread[2] < _FLAT * spread[0] else cv2.SOLVEPNP_SQPNP
+    method = cv2.SOLVEPNP_IPPE if spread[2] < _PLANAR * spread[0] else cv2.SOLVEPNP_SQPNP
     corners, image, camera = np.ascontiguousarray(corners), np.ascontiguousarray(image), np.eye(3)
     _, turns, shifts, _ = cv2.solvePnPGeneric(corners, image, camera, None, flags=method)
     refined = [

@@ -1,121 +1,225 @@
-"""What a comparison method is given and what it gives back."""
+"""What a baseline is given and what it returns; how it appears in the tables; the registry of baselines."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
-from typing import Any
+from dataclasses import dataclass, field, fields
+from typing import Any, Literal, NamedTuple, TypeVar, get_args
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from torchstickcal.errors import CalibrationError
-from torchstickcal.model.measurements import Measurements
+from torchstickcal.errors import CalibrationError, ConfigError
 from torchstickcal.model.state import State
 from torchstickcal.observations import Observations
-from torchstickcal.pipeline.initialise.triangulate import triangulate
-from torchstickcal.pipeline.scale import Ruler, scale_factors
+from torchstickcal.registry import Registry
+from torchstickcal.result import Calibration
 from torchstickcal.simulate import CubeViews
 
 Array = NDArray[np.float64]
 
-_TRIANGULATION_RADIUS_PX = 40.0
+ComparisonTable = Literal["sota", "inputs", "ablation"]
+"""The tables that have a counterpart in the paper: comparison of methods, input variants, ablation of the last stage."""
 
-BONES = (
-    ("neck", "head"), ("head", "head_top"),
-    ("right_shoulder", "right_elbow"), ("right_elbow", "right_wrist"), ("right_wrist", "right_hand"),
-    ("left_shoulder", "left_elbow"), ("left_elbow", "left_wrist"), ("left_wrist", "left_hand"),
-    ("right_knee", "right_shin"), ("right_shin", "right_ankle"),
-    ("left_knee", "left_shin"), ("left_shin", "left_ankle"),
-)  # fmt: skip
-"""The limbs, by the names of their joints: those whose length does not change with posture."""
+OWN_CONFIGURATIONS = 60
+"""Positions from here on belong to the library's own configurations: at the end of the tables."""
 
 
 class MissingInputError(CalibrationError):
-    """A method lacks an input that it cannot do without."""
+    """A baseline needs an input that is not given."""
 
 
 @dataclass(frozen=True)
 class Inputs:
-    """Everything that some method may use; each takes what it needs."""
+    """Everything that a baseline may use; each baseline takes what it needs, and inputs that are not known are None.
+
+    Args:
+        observations: keypoints of the joints and of the stick, intrinsics, stick length.
+        height_m: height of the athlete, metres: the distance from the top of the head to the middle of the ankles.
+        bone_lengths_m: lengths of bones in metres, by the names of the two joints.
+        cube: keypoints of a calibration cube.
+        orientations: unit direction vectors of the limbs :data:`BONES` in the frame of each camera, (C, F, B, 3); NaN where
+            not known.
+
+    Example:
+        >>> from torchstickcal.benchmark.baselines import BASELINES, Inputs
+        >>> from torchstickcal.simulate import golf_session
+        >>> observations, truth = golf_session(cameras=4, frames=30)
+        >>> estimate = BASELINES["kineo"](Inputs(observations, height_m=1.72))
+        >>> estimate.status, estimate.rotations.shape
+        ('converged', torch.Size([4, 3, 3]))
+    """
 
     observations: Observations
     height_m: float | None = None
-    """the athlete's stature, from the top of the head to the ankles"""
     bone_lengths_m: Mapping[tuple[str, str], float] | None = None
-    """lengths of bones by the names of their ends"""
     cube: CubeViews | None = None
     orientations: Array | None = None
-    """(C, F, B, 3), unit directions of the limbs ``BONES`` in each camera's frame, NaN where not known"""
 
 
 @dataclass(frozen=True)
 class Estimate:
-    """Poses of all cameras, world to camera, metres; the first camera is the world."""
+    """Extrinsics of all cameras, as a baseline returns them: world to camera, with the first camera as the world.
+
+    Args:
+        rotations: (C, 3, 3).
+        translations: (C, 3), metres. NaN for a camera whose pose could not be estimated.
+        status: ``converged``, or one sentence that says why not.
+
+    Example:
+        >>> identity = torch.eye(3, dtype=torch.float64).expand(4, 3, 3)
+        >>> Estimate(identity, torch.zeros(4, 3, dtype=torch.float64), "converged").translations.shape
+        torch.Size([4, 3])
+    """
 
     rotations: Tensor
-    """(C, 3, 3)"""
     translations: Tensor
-    """(C, 3)"""
     status: str
-    """``converged``, or one sentence why not"""
 
     @staticmethod
-    def of(state: State, status: str) -> Estimate:
-        """The cameras of one session's state."""
+    def of_state(state: State, status: str) -> Estimate:
+        """The cameras of the first session of a state."""
         return Estimate(state.rotations[0], state.translations[0], status)
 
+    @staticmethod
+    def of_calibration(calibration: Calibration, scale: float = 1.0) -> Estimate:
+        """The cameras of a calibration, with translations multiplied by a scale."""
+        translations = calibration.translations.to(torch.float64) * scale
+        return Estimate(calibration.rotations.to(torch.float64), translations, calibration.status)
 
-Baseline = Callable[[Inputs], Estimate]
+
+class PublishedErrors(NamedTuple):
+    """Mean errors of a method in the paper, and the variation that it calls variances (of the size of standard deviations)."""
+
+    rotation_deg: float
+    translation_m: float
+    rotation_variation_deg: float | None = None
+    translation_variation_m: float | None = None
+
+
+@dataclass(frozen=True)
+class Listing:
+    """How a method appears in the tables of the benchmark.
+
+    Args:
+        title: of its rows.
+        tables: the tables of the paper in which it has a row, ``"sota"`` (comparison of methods), ``"inputs"`` (input
+            variants) or ``"ablation"``, each with the errors that the paper reports, or None if it reports none. All methods
+            appear in the other tables (efficiency, success, failures).
+        reasons: why its errors may differ from the published ones; shown if they differ by more than 30 %.
+        position: the rows of a table are sorted by it, smallest first.
+        row: title of a row that it shares with other methods of the same ``row``, in the tables of the paper: their mean.
+
+    Raises:
+        ConfigError: for an unknown table.
+    """
+
+    title: str
+    tables: Mapping[ComparisonTable, PublishedErrors | None] = field(default_factory=dict)
+    reasons: tuple[str, ...] = ()
+    position: int = 50
+    row: str = ""
+
+    def __post_init__(self) -> None:
+        _check_names(self.tables, get_args(ComparisonTable), "unknown table", f"tables of {self.title!r}")
+
+
+@dataclass(frozen=True)
+class Baseline:
+    """A comparison method: call it with :class:`Inputs` to get an :class:`Estimate`.
+
+    Args:
+        estimate: the method.
+        listing: how it appears in the tables.
+        needs: names of the fields of :class:`Inputs` that it cannot do without.
+        title_in_motion: title of a second row, in which the method is given the true mean height of the athlete during the
+            session instead of the stature; empty for no such row.
+
+    Raises:
+        ConfigError: for an unknown input in ``needs``.
+
+    Example:
+        >>> from torchstickcal.benchmark import BASELINES
+        >>> BASELINES["kineo"].needs, BASELINES["kineo"].title_in_motion
+        (('height_m',), 'Kineo, true mean height in motion')
+    """
+
+    estimate: Callable[[Inputs], Estimate]
+    listing: Listing
+    needs: tuple[str, ...] = ()
+    title_in_motion: str = ""
+
+    def __post_init__(self) -> None:
+        _check_names(self.needs, [entry.name for entry in fields(Inputs)], "unknown input", f"needs of {self.listing.title!r}")
+
+    def __call__(self, inputs: Inputs) -> Estimate:
+        """Estimate the cameras.
+
+        Raises:
+            MissingInputError: if an input that the method needs is not given.
+            CalibrationError: if the method cannot use the observations.
+        """
+        for name in self.needs:
+            required(inputs, name)
+        return self.estimate(inputs)
+
+
+BASELINES: Registry[Baseline] = Registry("baseline", "torchstickcal.benchmark.baselines")
+"""The comparison methods, by name. A module of this folder, or one of your own, adds one with :func:`baseline`."""
+
+
+_Function = TypeVar("_Function", bound=Callable[[Inputs], Estimate])
+
+
+def baseline(
+    name: str, listing: Listing, *, needs: tuple[str, ...] = (), title_in_motion: str = "", replace: bool = False
+) -> Callable[[_Function], _Function]:
+    """A decorator that registers a function as a comparison method of the benchmark, and returns it unchanged.
+
+    Args:
+        name: of the method, as in ``benchmark --methods``.
+        listing, needs, title_in_motion: as of :class:`Baseline`.
+        replace: whether to replace a baseline of that name.
+
+    Raises:
+        ConfigError: if the name is in use, or for an unknown input in ``needs``.
+
+    Example::
+
+        from torchstickcal import calibrate
+        from torchstickcal.benchmark import Estimate, Inputs, Listing, baseline
+
+        @baseline("tall", Listing("Human, 1 % too tall", {"inputs": None}), needs=("height_m",))
+        def tall(inputs: Inputs) -> Estimate:
+            config = {"extends": "human_only", "scale": {"length_m": 1.01 * inputs.height_m}}
+            return Estimate.of_calibration(calibrate(inputs.observations, config))
+    """
+
+    def register(estimate: _Function) -> _Function:
+        BASELINES.register(name, Baseline(estimate, listing, needs, title_in_motion), replace=replace)
+        return estimate
+
+    return register
 
 
 def required(inputs: Inputs, name: str) -> Any:
     """An input by its name.
 
     Raises:
-        MissingInputError: if it was not given.
+        MissingInputError: if it is not given.
     """
     value = getattr(inputs, name)
     if value is None:
-        raise MissingInputError("the method lacks an input", where=f"Inputs.{name}", got="None", expected=name)
+        raise MissingInputError(
+            "the baseline needs an input that is not given", where=f"Inputs.{name}", got="None", expected=name
+        )
     return value
 
 
-def joint_measurements(observations: Observations) -> Measurements:
-    """The joints' measurements, without the sticks."""
-    ends = {end for stick in observations.sticks for end in stick.ends}
-    return Measurements.of(observations, [point for point in range(observations.num_points) if point not in ends])
-
-
-def bone_indices(observations: Observations) -> list[tuple[int, int]]:
-    """The points' indices of the limbs ``BONES``.
-
-    Raises:
-        ObservationError: if the session has no such joint.
-    """
-    return [(observations.point_index(start), observations.point_index(end)) for start, end in BONES]
-
-
-def scaled_by_height(inputs: Inputs, measurements: Measurements, state: State) -> State:
-    """The scene brought to scale by the athlete's height, as the paper does with the stick: by its mean over the session.
-
-    The mean distance from the top of the head to the middle of the ankles is set to the stature. An athlete in motion is
-    shorter than that by some percent, which is the weakness of this ruler.
-
-    Raises:
-        MissingInputError: if the height is not given.
-    """
-    top, *ankles = (inputs.observations.point_index(name) for name in ("head_top", "left_ankle", "right_ankle"))
-    height_m = measurements.lengths_m.new_full((1,), required(inputs, "height_m"))
-    ruler = Ruler((top,), tuple(ankles), height_m, rigid=False)
-    return state.scaled(scale_factors(measurements, state.points, [ruler]))
-
-
-def triangulated(measurements: Measurements, rotations: Tensor, translations: Tensor) -> State:
-    """The points of all frames at poses (1, C, 3, 3), (1, C, 3), zero where fewer than two cameras see them."""
-    rays = measurements.cameras[0].undistort(measurements.pixels[0].movedim(1, -1)).movedim(-1, 1)
-    weights = measurements.confidence[0] * rays.isfinite().all(1)
-    scale = _TRIANGULATION_RADIUS_PX / float(measurements.cameras.focal_px.mean())
-    points = triangulate(rotations[0], translations[0], rays.nan_to_num(), weights, scale=scale)
-    return State.of(rotations, translations, points.nan_to_num()[None])
+def _check_names(names: Mapping[Any, Any] | tuple[str, ...], known: Any, what: str, where: str) -> None:
+    """Raise a ConfigError for the first name that is not known."""
+    for name in names:
+        if name not in known:
+            raise ConfigError(what, where=where, got=repr(name), expected=f"one of {', '.join(known)}")

@@ -1,9 +1,8 @@
 """CalibPerson (Lee et al., "Extrinsic camera calibration from a moving person", RA-L 2022).
 
-Limb directions give the relative rotations, the keypoints then the translations, both linearly; a bundle adjustment that
-asks for bones of constant length finishes. In the published method a learned network lifts each view to the limbs' 3D
-directions; here they are an input, the true directions in every camera's frame with noise, so that the result does not
-depend on a network's training but has the errors of one.
+The directions of the limbs give the relative rotations, the keypoints then give the translations, both by linear equations. A
+bundle adjustment with bones of constant length follows. In the published method a neural network estimates the 3D directions
+of the limbs from each view. Here they are an input: the true directions with noise as of such a network.
 """
 
 from __future__ import annotations
@@ -11,15 +10,10 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from torchstickcal.benchmark.baselines.base import (
-    Estimate,
-    Inputs,
-    bone_indices,
-    joint_measurements,
-    required,
-    scaled_by_height,
-)
+from torchstickcal.benchmark.baselines.base import Estimate, Inputs, Listing, PublishedErrors, baseline, required
 from torchstickcal.benchmark.baselines.frame_adjustment import FrameResiduals, adjust
+from torchstickcal.benchmark.baselines.joints import bone_indices, joint_measurements, scaled_by_height
+from torchstickcal.benchmark.baselines.reasons import CONVERGED, HEIGHT
 from torchstickcal.losses import ReprojectionLoss
 from torchstickcal.model.measurements import Measurements
 from torchstickcal.model.state import State
@@ -28,19 +22,23 @@ _SIGMA_LENGTH_SHARE = 0.01
 _TINY = 1e-12
 
 
+@baseline(
+    "calib_person",
+    Listing("CalibPerson", {"sota": PublishedErrors(0.268, 0.072)}, (HEIGHT, CONVERGED), position=21),
+    needs=("orientations", "height_m"),
+    title_in_motion="CalibPerson, true mean height in motion",
+)
 def calib_person(inputs: Inputs) -> Estimate:
-    """Rotations by Procrustes over the limbs, translations from collinearity and coplanarity, adjustment, height.
+    """Rotations by Procrustes alignment of the limbs, translations, bundle adjustment, scale from the height.
 
     Args:
         inputs: needs ``orientations`` and ``height_m``.
 
     Raises:
-        MissingInputError: if one of them is not given.
         ObservationError: if the joints of the limbs are not among the points.
     """
     observations = inputs.observations
     orientations = torch.as_tensor(required(inputs, "orientations"), dtype=torch.float64)
-    required(inputs, "height_m")
     bones = torch.tensor(bone_indices(observations))
     measurements = joint_measurements(observations)
     rotations = relative_rotations(orientations)
@@ -48,14 +46,17 @@ def calib_person(inputs: Inputs) -> Estimate:
     adjusted = adjust(measurements, state, ReprojectionLoss(), _length_variance(measurements, bones))
     state = scaled_by_height(inputs, measurements, adjusted.state)
     status = "converged" if adjusted.converged else "the bundle adjustment stopped before it had converged"
-    return Estimate.of(state, status)
+    return Estimate.of_state(state, status)
 
 
 def relative_rotations(orientations: Tensor) -> Tensor:
-    """Rotations (C, 3, 3) from the first camera's frame that lay its limb directions onto each camera's (Procrustes).
+    """Rotations from the first camera to each camera, by Procrustes alignment of the limb directions.
 
     Args:
-        orientations: (C, F, B, 3), NaN where not known.
+        orientations: unit vectors (C, F, B, 3); NaN where not known.
+
+    Returns:
+        (C, 3, 3).
     """
     directions = orientations.flatten(1, 2)
     both = (directions.isfinite().all(-1) & directions[:1].isfinite().all(-1))[..., None]
@@ -67,11 +68,16 @@ def relative_rotations(orientations: Tensor) -> Tensor:
 
 
 def linear_state(measurements: Measurements, rotations: Tensor, bones: Tensor) -> State:
-    """Translations and points up to scale at known rotations: the null vector of all linear constraints together.
+    """Translations and points up to scale at known rotations: the solution of a homogeneous linear system.
 
-    Collinearity: a point lies on the ray of each camera that sees it. Coplanarity: a limb lies in the plane of the camera's
-    centre and its image. The points of a frame are eliminated, the eigenvector of the least eigenvalue over the
-    translations of all cameras but the first remains; its sign puts the points before the cameras.
+    Collinearity: a point lies on the ray of each camera that sees it. Coplanarity: a limb lies in the plane through the camera
+    centre and the image of the limb. The points of each frame are eliminated. The solution is the eigenvector of the smallest
+    eigenvalue for the translations of all cameras but the first, with the sign that puts the points in front of the cameras.
+
+    Args:
+        measurements: of one session.
+        rotations: (C, 3, 3).
+        bones: indices of the two joints of each limb, (B, 2).
     """
     m = measurements
     cameras, joints = len(rotations), m.points_per_frame
@@ -79,7 +85,8 @@ def linear_state(measurements: Measurements, rotations: Tensor, bones: Tensor) -
     visible = m.by_frame(m.visible[0] & rays.isfinite().all(-1)).movedim(1, 0)
     rays = m.by_frame(torch.cat([rays, torch.ones_like(rays[..., :1])], dim=-1).nan_to_num().movedim(-1, 0)).permute(2, 1, 3, 0)
 
-    # Rows e1 - u e3 and e2 - v e3 of a camera's frame, (F, C, J, 2, 3), vanish on its point; normals (F, C, B, 3) on its limb.
+    # In camera axes: rows e1 - u e3 and e2 - v e3, (F, C, J, 2, 3), are orthogonal to the point with image (u, v); normals,
+    # (F, C, B, 3), are orthogonal to the limb.
     across = (torch.eye(3).to(rays)[:2] - rays[..., :2, None] * torch.eye(3).to(rays)[2]) * visible[..., None, None]
     normals = torch.linalg.cross(rays[:, :, bones[:, 0]], rays[:, :, bones[:, 1]], dim=-1)
     normals = normals / normals.norm(dim=-1, keepdim=True).clamp_min(_TINY) * visible[:, :, bones].all(-1)[..., None]
@@ -102,7 +109,7 @@ def linear_state(measurements: Measurements, rotations: Tensor, bones: Tensor) -
 
 
 def _length_variance(measurements: Measurements, bones: Tensor) -> FrameResiduals:
-    """A bone's deviation from its mean length over the session, in logarithms: as a share of it, and blind to the scale."""
+    """Residuals (F, B): logarithm of a bone's length minus the mean logarithm over the session; independent of the scale."""
     complete = measurements.by_frame(measurements.active[0])[:, bones].all(-1)
 
     def residuals(points: Tensor) -> Tensor:

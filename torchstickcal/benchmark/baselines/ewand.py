@@ -1,8 +1,8 @@
 """eWand, a calibration with a wand (Gossard et al., ICRA 2024).
 
-A wand with markers on a line at known distances is waved through the scene. Of the published method the frame cameras' part
-is here: relative poses of pairs, then bundle adjustment of the markers' trajectories with residuals of reprojection, of the
-wand's length and of its straightness, under a robust loss.
+A wand with markers on a line at known distances is waved through the scene. This is the part of the published method for frame
+cameras: relative poses of pairs, then a robust bundle adjustment of the markers with residuals of the reprojection, of the
+length of the wand and of its straightness.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from torchstickcal.benchmark.baselines.base import Estimate, Inputs, MissingInputError
+from torchstickcal.benchmark.baselines.base import Estimate, Inputs, Listing, MissingInputError, baseline
 from torchstickcal.benchmark.baselines.frame_adjustment import FrameResiduals, adjust
 from torchstickcal.config import InitialiseSettings
 from torchstickcal.losses import Huber, ReprojectionLoss
@@ -23,18 +23,18 @@ MIDDLE = "stick_middle"
 _SIGMA_M = 0.001
 
 
+@baseline("ewand", Listing("eWand", {"sota": None}, position=24))
 def ewand(inputs: Inputs) -> Estimate:
     """The stick as a wand.
 
-    A stick with two tracked ends has nothing to be straight: the residual of straightness takes part only where the session
-    has a third point on its stick, named ``stick_middle``.
+    The residual of straightness is used only if the session has a third point on its stick, named ``stick_middle``.
 
     Args:
-        inputs: needs a stick among the observations.
+        inputs: needs a stick in the observations.
 
     Raises:
-        MissingInputError: if there is no stick.
-        RigError: if the stick's ends alone do not relate the cameras.
+        MissingInputError: if the observations have no stick.
+        RigError: if the ends of the stick are not enough to initialise the cameras.
     """
     observations = inputs.observations
     if not observations.sticks:
@@ -49,15 +49,16 @@ def ewand(inputs: Inputs) -> Estimate:
     state = state.scaled(scale_factors(measurements, state.points, known))
     adjusted = adjust(measurements, state, ReprojectionLoss(kernel=Huber()), _wand(measurements, middle))
     status = "converged" if adjusted.converged else "the bundle adjustment stopped before it had converged"
-    return Estimate.of(adjusted.state, status)
+    return Estimate.of_state(adjusted.state, status)
 
 
 def _middle(observations: Observations) -> list[int]:
-    """The third point of the first stick, if there is one."""
+    """Index of the third point of the first stick, if there is one."""
     return [point for point, name in enumerate(observations.point_names or ()) if name == MIDDLE]
 
 
 def _wand(measurements: Measurements, middle: list[int]) -> FrameResiduals:
+    """Residuals of the lengths of the sticks and of the distance of the middle point from the line through the ends."""
     starts, ends = measurements.sticks.unbind(1)
     complete, lengths_m = measurements.stick_active[0], measurements.lengths_m[0]
     with_middle = complete[:, :1] & measurements.by_frame(measurements.active[0])[:, middle]

@@ -1,7 +1,7 @@
-"""Bundle adjustment with residuals among the points of a frame, and priors of cameras, that the library's solvers do not know.
+"""Bundle adjustment for baselines, with any residuals between the points of a frame, and with priors of the camera poses.
 
-Levenberg-Marquardt on a dense system. The reprojection comes linearised from the library, a further residual by autograd;
-all points of a frame are eliminated together. One session at a time.
+Levenberg-Marquardt with dense blocks, for one session. The reprojection is linearised by the library, the other residuals by
+autograd. All points of a frame are eliminated together (Schur complement).
 """
 
 from __future__ import annotations
@@ -27,24 +27,27 @@ _COST_TOLERANCE = 1e-6
 _EXACT_COST_PER_KEYPOINT = 1e-18
 
 FrameResiduals = Callable[[Tensor], Tensor]
-"""Whitened residuals (F, M) of points (F, P, 3), those of a frame from that frame's points alone."""
+"""Whitened residuals (F, M) of points (F, P, 3); the residuals of a frame depend only on the points of this frame."""
 
 
 class CameraPrior(NamedTuple):
-    """Where the cameras are believed to be: the state's poses, and the information (C - 1, 6, 6) of their tangents."""
+    """A Gaussian prior of the camera poses."""
 
     rotations: Tensor
+    """(1, C, 3, 3)"""
     translations: Tensor
+    """(1, C, 3), metres"""
     information: Tensor
+    """(C - 1, 6, 6), inverse covariance of the tangents (translation, rotation) of all cameras but the first"""
 
 
 class Adjusted(NamedTuple):
-    """Where an adjustment ended."""
+    """Result of an adjustment."""
 
     state: State
     converged: bool
     reduced: Tensor
-    """(6 (C - 1), 6 (C - 1)), the information of all cameras' tangents, the points eliminated"""
+    """(6 (C - 1), 6 (C - 1)), information of the tangents of all cameras but the first, with the points eliminated"""
 
 
 def adjust(
@@ -55,23 +58,32 @@ def adjust(
     prior: CameraPrior | None = None,
     max_iterations: int = 50,
 ) -> Adjusted:
-    """Minimise reprojection, further residuals and prior over all points and all cameras but the first."""
+    """Minimise the sum of squared residuals over all points and over all cameras but the first.
+
+    Args:
+        measurements: of one session.
+        state: at which to start.
+        reprojection: loss of the reprojection.
+        frame_residuals: further residuals between the points of a frame.
+        prior: of the camera poses.
+        max_iterations: largest number of steps.
+    """
     objective = Objective(measurements, {"reprojection": reprojection})
-    exact = _EXACT_COST_PER_KEYPOINT * float(measurements.visible.sum())
+    negligible = _EXACT_COST_PER_KEYPOINT * float(measurements.visible.sum())
     damping = _INITIAL_DAMPING
     system = _linearise(objective, state, frame_residuals, prior)
-    converged = system.cost <= exact
+    converged = system.cost <= negligible
     for _ in range(max_iterations):
         if converged or damping > _MAX_DAMPING:
             break
-        camera_step, point_step, promised = system.step(damping)
+        camera_step, point_step, predicted = system.step(damping)
         candidate = state.retracted(camera_step, point_step)
-        reached = _linearise(objective, candidate, frame_residuals, prior)
-        decrease = system.cost - reached.cost
-        converged = abs(promised) <= _COST_TOLERANCE * system.cost or reached.cost <= exact
+        candidate_system = _linearise(objective, candidate, frame_residuals, prior)
+        decrease = system.cost - candidate_system.cost
+        converged = abs(predicted) <= _COST_TOLERANCE * system.cost or candidate_system.cost <= negligible
         if decrease > 0:
             converged = converged or decrease <= _COST_TOLERANCE * system.cost
-            state, system, damping = candidate, reached, max(damping * 0.1, _MIN_DAMPING)
+            state, system, damping = candidate, candidate_system, max(damping * 0.1, _MIN_DAMPING)
         else:
             damping *= 10
     return Adjusted(state, converged, system.reduce(0.0)[0])
@@ -79,7 +91,7 @@ def adjust(
 
 @dataclass(frozen=True)
 class _System:
-    """Gauss-Newton blocks at a state; n = 6 (C - 1) tangents, F frames of 3 P coordinates."""
+    """Blocks of the normal equations at a state: n = 6 (C - 1) camera tangents, F frames with 3 P coordinates each."""
 
     cost: float
     camera_hessian: Tensor
@@ -87,14 +99,19 @@ class _System:
     camera_gradient: Tensor
     """(n,)"""
     cross: Tensor
-    """(F, 3 P, n), of points with cameras"""
+    """(F, 3 P, n), mixed second derivatives by points and cameras"""
     point_hessian: Tensor
     """(F, 3 P, 3 P)"""
     point_gradient: Tensor
     """(F, 3 P)"""
 
     def reduce(self, damping: float) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """The camera system without the points, its gradient, and the factors L^-1 H_xc and L of the elimination."""
+        """Eliminate the points.
+
+        Returns:
+            The reduced camera system (n, n), its gradient (n,), and of each frame ``L^-1 H_xc`` (F, 3 P, n) and the Cholesky
+            factor ``L`` (F, 3 P, 3 P) of the damped point block.
+        """
         lower = torch.linalg.cholesky(_damped(self.point_hessian, damping))
         half = torch.linalg.solve_triangular(lower, self.cross, upper=False)
         gradient = torch.linalg.solve_triangular(lower, self.point_gradient[..., None], upper=False)
@@ -103,13 +120,13 @@ class _System:
         return reduced, self.camera_gradient - flat.mT @ gradient.flatten(), half, lower
 
     def step(self, damping: float) -> tuple[Tensor, Tensor, float]:
-        """Steps (C - 1, 6) of the cameras and (3, F P) of the points, and the decrease they promise."""
+        """Steps of the cameras (1, C - 1, 6) and of the points (1, 3, F P), and the predicted decrease of the cost."""
         reduced, rhs, half, lower = self.reduce(damping)
         cameras = -torch.linalg.solve(reduced, rhs)
         gradient = torch.linalg.solve_triangular(lower, self.point_gradient[..., None], upper=False)
         points = -torch.linalg.solve_triangular(lower.mT, gradient + (half @ cameras)[..., None], upper=True)[..., 0]
-        promised = -float(self.camera_gradient @ cameras + (self.point_gradient * points).sum())
-        return cameras.view(1, -1, 6), points.reshape(1, -1, 3).mT, promised
+        predicted = -float(self.camera_gradient @ cameras + (self.point_gradient * points).sum())
+        return cameras.view(1, -1, 6), points.reshape(1, -1, 3).mT, predicted
 
 
 def _linearise(
@@ -146,12 +163,12 @@ def _linearise(
 
 
 def _by_tangent(slopes: Tensor, points: Tensor) -> Tensor:
-    """Derivatives (..., 3, N) by the points as those by a camera's tangent, (..., 6): ``sum B^T g`` with B = [I, -[X]x]."""
+    """Derivatives by the tangent of a camera (..., 6) from those by the points (..., 3, N): ``sum B^T g``, B = [I, -[X]x]."""
     return torch.cat([slopes.sum(-1), torch.linalg.cross(points.expand_as(slopes), slopes, dim=-2).sum(-1)], dim=-1)
 
 
 def _differentiate(frame_residuals: FrameResiduals, points: Tensor) -> tuple[Tensor, Tensor]:
-    """Residuals (F, M) and their derivatives (F, M, 3 P) by the points of their own frame."""
+    """Residuals (F, M), and their derivatives (F, M, 3 P) by the points of the same frame."""
     points = points.detach().requires_grad_()
     residuals = frame_residuals(points)
     count = residuals.shape[1]
@@ -161,7 +178,7 @@ def _differentiate(frame_residuals: FrameResiduals, points: Tensor) -> tuple[Ten
 
 
 def _tangents(prior: CameraPrior, state: State) -> Tensor:
-    """Small tangents (C - 1, 6) that lead from the prior's poses to the state's, to first order."""
+    """Tangents (C - 1, 6) from the poses of the prior to those of the state, to first order."""
     to_world = prior.rotations[0, 1:].mT
     turn = to_world @ state.rotations[0, 1:]
     shift = (to_world @ (state.translations[0, 1:] - prior.translations[0, 1:])[..., None])[..., 0]
@@ -169,4 +186,5 @@ def _tangents(prior: CameraPrior, state: State) -> Tensor:
 
 
 def _damped(matrices: Tensor, damping: float) -> Tensor:
+    """Matrices (..., N, N) with their diagonals multiplied by 1 + damping."""
     return matrices + damping * matrices.diagonal(dim1=-2, dim2=-1).diag_embed()

@@ -1,7 +1,7 @@
 """The core of Kineo (Javerliat et al., "Kineo: calibration-free metric motion capture from sparse RGB cameras", 2025).
 
-Relative poses of all pairs, refined one by one; rotations averaged over the graph of pairs, then positions; an adjustment of
-cameras and a sample of the keypoints. The intrinsics, which the published method estimates too, are known here.
+Relative poses of all pairs of cameras, each refined on its own; rotation averaging and translation averaging over the graph of
+pairs; bundle adjustment of a sample of the keypoints. The published method also estimates the intrinsics; here they are known.
 """
 
 from __future__ import annotations
@@ -11,14 +11,9 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from torchstickcal.benchmark.baselines.base import (
-    Estimate,
-    Inputs,
-    joint_measurements,
-    required,
-    scaled_by_height,
-    triangulated,
-)
+from torchstickcal.benchmark.baselines.base import Estimate, Inputs, Listing, PublishedErrors, baseline
+from torchstickcal.benchmark.baselines.joints import joint_measurements, scaled_by_height, triangulated
+from torchstickcal.benchmark.baselines.reasons import CONVERGED, HEIGHT
 from torchstickcal.config import InitialiseSettings
 from torchstickcal.errors import RigError
 from torchstickcal.geometry import se3
@@ -36,20 +31,24 @@ _REWEIGHTINGS = 20
 _SMALLEST_RESIDUAL = 1e-6
 
 
+@baseline(
+    "kineo",
+    Listing("Kineo", {"sota": PublishedErrors(0.075, 0.098)}, (HEIGHT, CONVERGED), position=23),
+    needs=("height_m",),
+    title_in_motion="Kineo, true mean height in motion",
+)
 def kineo(inputs: Inputs) -> Estimate:
-    """Pairs, Sampson refinement, rotation and translation averaging, adjustment of a sample, height.
+    """Pairs, Sampson refinement, rotation and translation averaging, bundle adjustment of a sample, scale from the height.
 
     Args:
         inputs: needs ``height_m``.
 
     Raises:
-        MissingInputError: if the height is not given.
-        RigError: if the cameras do not hang together.
+        RigError: if the pairs do not connect all cameras.
     """
     observations = inputs.observations
-    required(inputs, "height_m")
     measurements = joint_measurements(observations)
-    pairs = _related(measurements, [observations.camera_label(camera) for camera in range(observations.num_cameras)])
+    pairs = _related_pairs(measurements, [observations.camera_label(camera) for camera in range(observations.num_cameras)])
     rotations = average_rotations(observations.num_cameras, pairs)
     translations = average_translations(rotations, pairs)
 
@@ -69,12 +68,12 @@ def kineo(inputs: Inputs) -> Estimate:
     whole = triangulated(measurements, outcome.state.rotations, outcome.state.translations)
     state = scaled_by_height(inputs, measurements, whole)
     stop = outcome.stops[0]
-    return Estimate.of(state, "converged" if stop.converged else str(stop))
+    return Estimate.of_state(state, "converged" if stop.converged else str(stop))
 
 
 @dataclass(frozen=True)
 class RelatedPair:
-    """Two cameras' relative pose: ``x_second = R x_first + s direction``."""
+    """Relative pose of two cameras: ``x_second = R x_first + s direction`` with an unknown scale s."""
 
     first: int
     second: int
@@ -83,15 +82,15 @@ class RelatedPair:
     direction: Tensor
     """(3,), a unit vector in the second camera's frame"""
     weight: float
-    """inliers"""
+    """number of inliers"""
 
 
 def average_rotations(cameras: int, pairs: list[RelatedPair]) -> Tensor:
-    """Rotations (C, 3, 3) that fit those of the pairs, the first one being the identity.
+    """Rotation averaging: rotations (C, 3, 3) of all cameras from those of the pairs; the first one is the identity.
 
-    The chordal problem ``min sum w |R_j - R_ij R_i|_F^2`` is linear without the constraint: the eigenvectors of the three
-    least eigenvalues, laid onto the nearest rotations. Re-weighting by the inverse of each pair's angle makes it the L1
-    average.
+    Chordal averaging minimises ``sum w |R_j - R_ij R_i|_F^2``. Without the constraint that the R are rotations the solution
+    is given by the eigenvectors of the three smallest eigenvalues; they are projected onto rotations. Iterative re-weighting
+    by the inverse of each pair's residual angle makes it an L1 average, which is robust to wrong pairs.
     """
     weights = torch.tensor([pair.weight for pair in pairs], dtype=torch.float64)
     relative = torch.stack([pair.rotation for pair in pairs])
@@ -114,18 +113,19 @@ def average_rotations(cameras: int, pairs: list[RelatedPair]) -> Tensor:
 
 
 def average_translations(rotations: Tensor, pairs: list[RelatedPair]) -> Tensor:
-    """Translations (C, 3), up to scale, whose centres lie along the pairs' directions; zero for the first camera.
+    """Translation averaging: translations (C, 3) of all cameras, up to scale, from the directions of the pairs.
 
-    The part of ``c_i - c_j`` across the direction of each pair is to vanish, all centres together having length 1.
+    Minimises the part of ``c_i - c_j`` that is orthogonal to the direction of the pair, over camera centres of norm 1 in
+    total. The translation of the first camera is 0.
     """
     cameras = len(rotations)
     weights = torch.tensor([pair.weight for pair in pairs], dtype=torch.float64)
     baselines = torch.stack([rotations[pair.second].mT @ pair.direction for pair in pairs])
-    across = torch.eye(3, dtype=torch.float64) - baselines[:, :, None] * baselines[:, None]
+    orthogonal = torch.eye(3, dtype=torch.float64) - baselines[:, :, None] * baselines[:, None]
     ends = torch.tensor([(pair.first, pair.second) for pair in pairs])
     signs = torch.nn.functional.one_hot(ends, cameras).to(weights)
     incidence = (signs[:, 0] - signs[:, 1])[:, 1:]
-    rows = torch.einsum("kab,kc->kacb", across, incidence).flatten(2)
+    rows = torch.einsum("kab,kc->kacb", orthogonal, incidence).flatten(2)
     matrix = torch.einsum("kai,kaj,k->ij", rows, rows, weights)
     centres = torch.linalg.eigh(matrix).eigenvectors[:, 0].view(-1, 3)
     centres = centres * (weights * ((incidence @ centres) * baselines).sum(1)).sum().sign()
@@ -136,12 +136,15 @@ def average_translations(rotations: Tensor, pairs: list[RelatedPair]) -> Tensor:
 def refine_by_sampson(
     rotation: Tensor, direction: Tensor, first: Tensor, second: Tensor, sigma: float
 ) -> tuple[Tensor, Tensor]:
-    """Gauss-Newton on the Sampson distances of a pair's rays, robustly, over its rotation and its direction.
+    """Refine the relative pose of a pair: Gauss-Newton on the Sampson distances, with a Huber kernel.
 
     Args:
-        rotation: (3, 3) and direction: (3,), ``x_second = R x_first + s direction``.
-        first: (N, 3) and second: (N, 3), homogeneous normalised coordinates.
-        sigma: distance at which the robust kernel starts to bend.
+        rotation: (3, 3). direction: (3,), a unit vector; ``x_second = R x_first + s direction``.
+        first: homogeneous normalised image points in the first camera, (N, 3). second: in the second camera, (N, 3).
+        sigma: standard deviation of the distances; the kernel is quadratic up to about this distance.
+
+    Returns:
+        The refined rotation (3, 3) and direction (3,).
     """
     for _ in range(_REFINEMENTS):
         plane = torch.linalg.svd(direction[None]).Vh[1:]
@@ -159,7 +162,10 @@ def refine_by_sampson(
 def _sampson_distances(
     step: Tensor, rotation: Tensor, direction: Tensor, plane: Tensor, first: Tensor, second: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """Signed Sampson distances (N,), twice, at a small step: three of the rotation, two of the direction in a plane."""
+    """Signed Sampson distances (N,) after a step (5,): rotation vector, then direction in ``plane`` (2, 3).
+
+    Returns them twice: to be differentiated, and as the values.
+    """
     essential = se3.hat(direction + step[3:] @ plane) @ rotation @ (torch.eye(3).to(step) + se3.hat(step[:3]))
     lines_second, lines_first = first @ essential.mT, second @ essential
     gradient = lines_second[:, :2].square().sum(1) + lines_first[:, :2].square().sum(1)
@@ -167,11 +173,11 @@ def _sampson_distances(
     return distances, distances
 
 
-def _related(measurements: Measurements, labels: list[str]) -> list[RelatedPair]:
-    """All pairs of cameras with enough in common, related by RANSAC and refined.
+def _related_pairs(measurements: Measurements, labels: list[str]) -> list[RelatedPair]:
+    """Relative poses of all pairs of cameras with enough common points, by RANSAC and refinement.
 
     Raises:
-        RigError: if they leave a camera out.
+        RigError: if the pairs do not connect all cameras.
     """
     settings, views = InitialiseSettings(), Views(measurements)
     common, cameras = views.common(), range(len(labels))
@@ -189,10 +195,11 @@ def _related(measurements: Measurements, labels: list[str]) -> list[RelatedPair]
     for _ in cameras:
         linked = linked.union(*({pair.first, pair.second} for pair in pairs if linked & {pair.first, pair.second}))
     if len(linked) < len(labels):
+        isolated = ", ".join(label for camera, label in enumerate(labels) if camera not in linked)
         raise RigError(
-            "cameras see too little in common to be placed in one rig",
+            "the cameras have too few common points to be placed in one rig",
             where="keypoints",
-            got=f"{', '.join(label for camera, label in enumerate(labels) if camera not in linked)} cut off",
-            expected=f"at least {settings.min_common_points} common points that fit one pose, between some pair",
+            got=f"{isolated} not connected to the other cameras",
+            expected=f"for each camera another one with at least {settings.min_common_points} common points that fit one pose",
         )
     return pairs

@@ -1,4 +1,4 @@
-"""Inputs of the comparison methods, made from a known truth."""
+"""Inputs of baselines that are made from the truth of a session."""
 
 from __future__ import annotations
 
@@ -7,23 +7,26 @@ from collections.abc import Sequence
 import numpy as np
 from torch import Tensor
 
-from torchstickcal.benchmark.baselines.base import BONES, Array
+from torchstickcal.benchmark.baselines.base import Array
+from torchstickcal.benchmark.baselines.joints import BONES
 from torchstickcal.io.session import SPORTS_STICK_SYN_JOINTS
 
 
 def limb_orientations(
     true_rotations: Tensor, points: Tensor, sigma_deg: float, seed: int, names: Sequence[str] = SPORTS_STICK_SYN_JOINTS
 ) -> Array:
-    """Directions (C, F, B, 3) of the limbs ``BONES`` in each camera's frame, as a learned lifter of single views gives them.
-
-    Every camera's direction in every frame has an error of its own, of ``sigma_deg`` along each of the two axes across it.
+    """Directions of the limbs :data:`BONES` in each camera's frame with noise, like those of a monocular 3D pose network.
 
     Args:
         true_rotations: (C, 3, 3), world to camera.
-        points: (F, P, 3), the first of them named by ``names``.
-        sigma_deg: standard deviation.
-        seed: of the errors.
-        names: the joints' names.
+        points: (F, P, 3); the first of them are the joints.
+        sigma_deg: standard deviation of the noise along each of the two axes orthogonal to the direction, degrees; it is
+            independent in every camera and frame.
+        seed: of the noise.
+        names: of the joints.
+
+    Returns:
+        Unit vectors (C, F, B, 3).
     """
     starts, ends = ([list(names).index(bone[end]) for bone in BONES] for end in (0, 1))
     limbs = (points[:, ends] - points[:, starts]).numpy()
@@ -34,7 +37,11 @@ def limb_orientations(
 
 
 def bone_lengths(points: Tensor, names: Sequence[str]) -> dict[tuple[str, str], float]:
-    """Mean length over the session of the limbs ``BONES``, of points (F, P, 3) in the order of ``names``, metres."""
+    """Mean lengths of the limbs :data:`BONES` over the session, metres, by the names of their two joints.
+
+    Args:
+        points: (F, P, 3), metres. names: of the points.
+    """
     index = list(names).index
     return {
         (start, end): float((points[:, index(end)] - points[:, index(start)]).norm(dim=1).nanmean()) for start, end in BONES

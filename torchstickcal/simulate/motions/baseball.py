@@ -1,10 +1,10 @@
-"""Baseball: a right-handed batter's swing with a bat of 0.86 m. The pitcher is to the left (-x), the plate in front."""
+"""Baseball: the swing of a right-handed batter with a bat of 0.86 m. The pitcher is to the left (-x), home plate in front."""
 
 from __future__ import annotations
 
 from dataclasses import replace
 
-from torchstickcal.simulate.motions.base import Action, Posture, tilted_plane
+from torchstickcal.simulate.motions.base import SPORTS, Action, Posture, tilted_plane
 
 _LEFT, _RIGHT = (-0.22, 0.0, 0.0), (0.26, 0.0, 0.0)
 _STRIDDEN = (-0.38, 0.02, 0.0)
@@ -47,25 +47,28 @@ _CARRY = Posture(
     stick_elevation=20, left_foot=_LEFT, right_foot=_RIGHT,
 )  # fmt: skip
 
-BASEBALL = Action(
-    stick_m=0.86,
-    stick_names=("bat_knob", "bat_tip"),
-    grips_m={"left": 0.05, "right": 0.13},
-    plane=tilted_plane(75),
-    keys=(
-        (0.00, _STANCE),
-        (0.30, _STANCE),
-        (0.70, _LOAD),
-        (1.05, _STRIDE),
-        (1.20, _SLOT),
-        (1.32, _CONTACT),
-        (1.415, _EXTENSION),
-        (1.58, _FOLLOW),
-        (1.85, _FINISH),
-        (2.15, _FINISH),
-        (2.65, _CARRY),
-        (3.10, _CARRY),
+SPORTS.register(
+    "baseball",
+    Action(
+        stick_m=0.86,
+        stick_names=("bat_knob", "bat_tip"),
+        grips_m={"left": 0.05, "right": 0.13},
+        plane=tilted_plane(75),
+        keys=(
+            (0.00, _STANCE),
+            (0.30, _STANCE),
+            (0.70, _LOAD),
+            (1.05, _STRIDE),
+            (1.20, _SLOT),
+            (1.32, _CONTACT),
+            (1.415, _EXTENSION),
+            (1.58, _FOLLOW),
+            (1.85, _FINISH),
+            (2.15, _FINISH),
+            (2.65, _CARRY),
+            (3.10, _CARRY),
+        ),
+        period_s=3.6,
+        walk_s=(2.4, 3.4),
     ),
-    period_s=3.6,
-    walk_s=(2.4, 3.4),
 )

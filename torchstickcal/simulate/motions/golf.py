@@ -1,10 +1,10 @@
-"""Golf: a right-handed full swing with a club of 1 m. The target is to the athlete's left (-x), the ball in front."""
+"""Golf: the full swing of a right-handed player with a club of 1 m. The target is to the left (-x), the ball in front."""
 
 from __future__ import annotations
 
 from dataclasses import replace
 
-from torchstickcal.simulate.motions.base import Action, Posture, tilted_plane
+from torchstickcal.simulate.motions.base import SPORTS, Action, Posture, tilted_plane
 
 _LEFT, _RIGHT = (-0.22, 0.0, 0.0), (0.22, 0.0, 0.0)
 
@@ -42,25 +42,28 @@ _CARRY = Posture(
     stick_elevation=35,
 )  # fmt: skip
 
-GOLF = Action(
-    stick_m=1.00,
-    stick_names=("club_grip", "club_head"),
-    grips_m={"left": 0.05, "right": 0.13},
-    plane=tilted_plane(34),
-    keys=(
-        (0.00, _ADDRESS),
-        (0.25, _ADDRESS),
-        (0.60, _TAKEAWAY),
-        (1.15, _TOP),
-        (1.33, _LAGGING),
-        (1.435, _IMPACT),
-        (1.535, _RELEASE),
-        (1.72, _FOLLOW),
-        (2.10, _FINISH),
-        (2.40, _FINISH),
-        (2.95, _CARRY),
-        (3.55, _CARRY),
+SPORTS.register(
+    "golf",
+    Action(
+        stick_m=1.00,
+        stick_names=("club_grip", "club_head"),
+        grips_m={"left": 0.05, "right": 0.13},
+        plane=tilted_plane(34),
+        keys=(
+            (0.00, _ADDRESS),
+            (0.25, _ADDRESS),
+            (0.60, _TAKEAWAY),
+            (1.15, _TOP),
+            (1.33, _LAGGING),
+            (1.435, _IMPACT),
+            (1.535, _RELEASE),
+            (1.72, _FOLLOW),
+            (2.10, _FINISH),
+            (2.40, _FINISH),
+            (2.95, _CARRY),
+            (3.55, _CARRY),
+        ),
+        period_s=4.0,
+        walk_s=(2.7, 3.8),
     ),
-    period_s=4.0,
-    walk_s=(2.7, 3.8),
 )

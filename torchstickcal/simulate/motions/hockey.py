@@ -1,10 +1,10 @@
-"""Ice hockey: stick-handling, then a slap shot, with a stick of 1.6 m. Left hand on top, the goal to the left (-x)."""
+"""Ice hockey: stick-handling, then a slap shot, with a stick of 1.6 m. Left hand on top; the goal is to the left (-x)."""
 
 from __future__ import annotations
 
 from dataclasses import replace
 
-from torchstickcal.simulate.motions.base import Action, Posture, tilted_plane
+from torchstickcal.simulate.motions.base import SPORTS, Action, Posture, tilted_plane
 
 _LEFT, _RIGHT = (-0.24, 0.0, 0.0), (0.24, 0.0, 0.0)
 
@@ -37,27 +37,30 @@ _FOLLOW = replace(
     arms_angle=88, arms_elevation=-4, arms_reach_m=0.50, stick_angle=34, stick_elevation=4, right_foot=(0.20, 0.05, 0.08),
 )  # fmt: skip
 
-HOCKEY = Action(
-    stick_m=1.60,
-    stick_names=("stick_butt", "stick_blade"),
-    grips_m={"left": 0.05, "right": 0.52},
-    plane=tilted_plane(55),
-    keys=(
-        (0.00, _READY),
-        (0.22, _FOREHAND),
-        (0.50, _BACKHAND),
-        (0.78, _FOREHAND),
-        (1.06, _BACKHAND),
-        (1.36, _SET),
-        (1.90, _WIND_UP),
-        (2.07, _DRIVE),
-        (2.185, _STRIKE),
-        (2.30, _THROUGH),
-        (2.54, _FOLLOW),
-        (2.80, _FOLLOW),
-        (3.30, _READY),
-        (3.60, _READY),
+SPORTS.register(
+    "hockey",
+    Action(
+        stick_m=1.60,
+        stick_names=("stick_butt", "stick_blade"),
+        grips_m={"left": 0.05, "right": 0.52},
+        plane=tilted_plane(55),
+        keys=(
+            (0.00, _READY),
+            (0.22, _FOREHAND),
+            (0.50, _BACKHAND),
+            (0.78, _FOREHAND),
+            (1.06, _BACKHAND),
+            (1.36, _SET),
+            (1.90, _WIND_UP),
+            (2.07, _DRIVE),
+            (2.185, _STRIKE),
+            (2.30, _THROUGH),
+            (2.54, _FOLLOW),
+            (2.80, _FOLLOW),
+            (3.30, _READY),
+            (3.60, _READY),
+        ),
+        period_s=4.0,
+        walk_s=(2.9, 3.85),
     ),
-    period_s=4.0,
-    walk_s=(2.9, 3.85),
 )

@@ -1,10 +1,10 @@
-"""Kendo: from the middle guard, raise, step in and cut to the head (men), step back; a shinai of 1.2 m, the foe at +y."""
+"""Kendo: a step and a cut to the head (men) from the middle guard, with a shinai of 1.2 m. The opponent is in front (+y)."""
 
 from __future__ import annotations
 
 from dataclasses import replace
 
-from torchstickcal.simulate.motions.base import Action, Posture
+from torchstickcal.simulate.motions.base import SPORTS, Action, Posture
 
 _GUARD = Posture(
     forward_m=0.02, height_m=0.885, pelvis_lean=2, chest_lean=4, arms_angle=-50, arms_reach_m=0.46, stick_angle=74,
@@ -27,23 +27,26 @@ _THROUGH = replace(
 _GUARD_AHEAD = replace(_GUARD, forward_m=0.56, right_foot=(0.10, 0.70, 0.0), left_foot=(-0.10, 0.34, 0.03))
 _BACK = replace(_GUARD, forward_m=0.28, right_foot=(0.10, 0.50, 0.02), left_foot=(-0.10, -0.14, 0.05))
 
-KENDO = Action(
-    stick_m=1.20,
-    stick_names=("shinai_pommel", "shinai_tip"),
-    grips_m={"left": 0.04, "right": 0.27},
-    plane=((0.0, 1.0, 0.0), (0.0, 0.0, 1.0)),
-    keys=(
-        (0.00, _GUARD),
-        (0.30, _GUARD),
-        (0.60, _PRESS),
-        (0.98, _RAISED),
-        (1.10, _CUTTING),
-        (1.21, _STRIKE),
-        (1.45, _THROUGH),
-        (1.85, _GUARD_AHEAD),
-        (2.20, _BACK),
-        (2.60, _GUARD),
+SPORTS.register(
+    "kendo",
+    Action(
+        stick_m=1.20,
+        stick_names=("shinai_pommel", "shinai_tip"),
+        grips_m={"left": 0.04, "right": 0.27},
+        plane=((0.0, 1.0, 0.0), (0.0, 0.0, 1.0)),
+        keys=(
+            (0.00, _GUARD),
+            (0.30, _GUARD),
+            (0.60, _PRESS),
+            (0.98, _RAISED),
+            (1.10, _CUTTING),
+            (1.21, _STRIKE),
+            (1.45, _THROUGH),
+            (1.85, _GUARD_AHEAD),
+            (2.20, _BACK),
+            (2.60, _GUARD),
+        ),
+        period_s=3.6,
+        walk_s=(2.6, 3.4),
     ),
-    period_s=3.6,
-    walk_s=(2.6, 3.4),
 )
