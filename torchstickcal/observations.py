@@ -107,7 +107,7 @@ class Observations:
         intrinsics: camera matrices, (C, 3, 3) or one (3, 3) shared by all; None if they are to be found, for which the image
             size is needed. The principal point is then taken to be the image's centre.
         sticks: one stick or several; empty if the scale comes from elsewhere.
-        distortion: (C, D) or (D,), OpenCV's order, D of 4, 5 or 8; None for perfect lenses.
+        distortion: (C, D) or (D,), OpenCV's order, D of 4, 5, 8, 12 or 14; None for perfect lenses.
         confidence: (C, F, P) in [0, 1], the weight of a keypoint: its variance is divided by it. 0 is not seen.
         image_size: width and height in pixels, (C, 2) or (2,).
         fps: frames per second.
@@ -280,7 +280,7 @@ class Observations:
                     expected="[[fx, s, cx], [0, fy, cy], [0, 0, 1]] with fx, fy > 0, in pixels",
                 )
         if self.distortion is not None:
-            counts = (4,) if self.fisheye else (4, 5, 8)
+            counts = (4,) if self.fisheye else (4, 5, 8, 12, 14)
             shape = tuple(self.distortion.shape)
             if shape[-1:] not in {(n,) for n in counts} or shape[:-1] not in {(), (cameras,)}:
                 raise ObservationError(
