@@ -223,7 +223,7 @@ LOSS_SETS = {
     "shared with a stick": {
         "reprojection": ReprojectionLoss(9.0),
         "length": StickLengthLoss(0.1),
-        "equal": EqualLengths([19, 8, 10, 20], 0.1),
+        "equal": EqualLengths([19, 8, 10, 20], 3.0),
     },
     "over time": {
         "reprojection": ReprojectionLoss(9.0),

@@ -36,6 +36,13 @@ class LayerResult:
     """Calibrated rigs, in the frame of each session's first camera; leading B only where the keypoints had it.
 
     Poses, lenses, clocks and points carry gradients, and have the dtype and device of the keypoints.
+
+    Example:
+        >>> from torchstickcal.simulate import golf_session
+        >>> observations, truth = golf_session(cameras=3, frames=10)
+        >>> result = CalibrationLayer(observations.sticks)(observations.keypoints, observations.cameras)
+        >>> result.status, result.points.shape
+        (('converged',), torch.Size([10, 21, 3]))
     """
 
     rotations: Tensor
