@@ -12,7 +12,7 @@ import torch
 from torch import Tensor, nn
 
 from torchstickcal.config import Config, load_config
-from torchstickcal.errors import CalibrationError, ConfigError, ObservationError
+from torchstickcal.errors import ConfigError, ObservationError, RigError
 from torchstickcal.geometry.cameras import Intrinsics
 from torchstickcal.layer.inputs import LayerInputs
 from torchstickcal.model.measurements import Measurements
@@ -20,7 +20,8 @@ from torchstickcal.model.objective import Objective
 from torchstickcal.model.state import State
 from torchstickcal.model.unknowns import RigUnknowns
 from torchstickcal.observations import Stick
-from torchstickcal.pipeline.adjust import Adjustment, Run, WarmStart, adjust_cameras, adjust_points, begin
+from torchstickcal.pipeline.adjust import Adjustment, WarmStart, adjust_cameras, adjust_points, begin
+from torchstickcal.pipeline.run import Run
 from torchstickcal.pipeline.scale import rulers, scale_factors
 from torchstickcal.pipeline.stage import StageResult
 from torchstickcal.solvers.gradients import GradientMode, attach, gradient_mode
@@ -170,7 +171,7 @@ class CalibrationLayer(nn.Module):
             try:
                 with torch.no_grad():
                     return begin(given.observations(session), run, self._refined, start=_warm_start(initial, session))
-            except CalibrationError as error:
+            except (ObservationError, RigError) as error:
                 return f"{type(error).__name__}: {error}"
 
         starts = dict(enumerate(map_on_workers(device, begun, range(len(given.keypoints)))))
@@ -204,17 +205,13 @@ class CalibrationLayer(nn.Module):
 
         It depends on them through the last stage that estimated cameras and through those after it.
         """
-        known = [
-            replace(ruler, lengths_m=data.lengths_m[:, number]) if ruler.rigid else ruler
-            for number, ruler in enumerate(rulers(ended.observations, self.config))
-        ]
         state = ended.state
         for number, result in enumerate(ended.results):
             kept = replace(data, confidence=data.confidence.where(result.inliers, 0.0))
             fixed = None if result.stage.cameras == "free" else state if number else result.minimum
             state = attach(Objective(kept, result.losses), _polished(kept, result, fixed), self.gradient, fixed)
             if result.stage.rescale:
-                state = state.scaled(scale_factors(kept, state.points, known))
+                state = state.scaled(scale_factors(kept, state.points, rulers(kept, self.config)))
         return state
 
     @torch.no_grad()
