@@ -29,7 +29,7 @@ FLOORS = [
     ["pipeline.focal_search"],
     ["pipeline.adjust"],
     ["pipeline.check", "pipeline.warnings"],
-    ["pipeline.conclude", "pipeline.session"],
+    ["pipeline.attach", "pipeline.conclude", "pipeline.session"],
     ["pipeline"],
     ["layer"],
     ["show"],
