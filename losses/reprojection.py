@@ -11,7 +11,7 @@ from torch import Tensor
 from torchstickcal.geometry import projection
 from torchstickcal.geometry.cameras import Intrinsics, PixelMap, inverse_depths
 from torchstickcal.geometry.symmetric import symmetric_product
-from torchstickcal.losses.base import CameraPointLoss, CameraPointTerms, CameraUnknownsAt, UnknownTerms
+from torchstickcal.losses.camera_point import CameraPointLoss, CameraPointTerms, CameraUnknownsAt, UnknownTerms
 from torchstickcal.losses.registry import LossContext, LossSettings, register_loss
 from torchstickcal.losses.robust import robust_kernel
 

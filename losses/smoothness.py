@@ -8,8 +8,8 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from torchstickcal.losses.base import TrackLoss, combined
 from torchstickcal.losses.registry import LossContext, LossSettings, register_loss
+from torchstickcal.losses.track import TrackLoss, combined
 
 
 def second_differences(points: Tensor) -> Tensor:

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from torchstickcal.geometry.symmetric import DIAGONAL, expand, outer
-from torchstickcal.losses.base import FrameLoss, FrameTerms
+from torchstickcal.losses.frame import FrameLoss, FrameTerms
 from torchstickcal.losses.registry import LossContext, LossSettings, register_loss
 
 _MIN_LENGTH_M = 1e-6

@@ -16,6 +16,7 @@ FLOORS = [
     ["registry"],
     ["geometry"],
     ["losses"],
+    ["stick"],
     ["observations", "model.unknowns", "extrinsics"],
     ["config"],
     ["model"],

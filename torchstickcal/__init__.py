@@ -16,11 +16,12 @@ if TYPE_CHECKING:
     from torchstickcal.geometry.cameras import Intrinsics
     from torchstickcal.layer.layer import CalibrationLayer
     from torchstickcal.layer.result import LayerResult
-    from torchstickcal.observations import Observations, Stick
+    from torchstickcal.observations import Observations
     from torchstickcal.pipeline.calibrate import Callback, calibrate
     from torchstickcal.result import Calibration
     from torchstickcal.show.tensorboard import TensorBoardMonitor
     from torchstickcal.solvers.gradients import GaussNewton, GradientMode, Implicit, Unrolled
+    from torchstickcal.stick import Stick
 
 __version__ = version("torchstickcal")
 
@@ -41,7 +42,7 @@ _HOMES = {
     "ObservationError": "errors",
     "Observations": "observations",
     "RigError": "errors",
-    "Stick": "observations",
+    "Stick": "stick",
     "TensorBoardMonitor": "show.tensorboard",
     "Unrolled": "solvers.gradients",
     "calibrate": "pipeline.calibrate",

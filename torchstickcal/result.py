@@ -18,9 +18,9 @@ from torchstickcal.errors import FileFormatError
 from torchstickcal.files import atomic_path
 from torchstickcal.geometry import se3
 from torchstickcal.geometry.cameras import Intrinsics
-from torchstickcal.observations import Stick
 from torchstickcal.solvers import IterationRecord, StageRecord, Stop
 from torchstickcal.solvers.uncertainty import centre_covariances, point_covariances, relative_scale_std
+from torchstickcal.stick import Stick
 
 _FORMAT = "torchstickcal calibration 5"
 _TENSORS = (

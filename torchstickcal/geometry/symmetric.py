@@ -24,6 +24,11 @@ def expand(entries: Tensor) -> Tensor:
     return entries[..., _ENTRIES, :].unflatten(-2, (3, 3))
 
 
+def six_entries(matrices: Tensor) -> Tensor:
+    """The six distinct entries (..., 6, N) of symmetric matrices (..., 3, 3, N)."""
+    return torch.stack([matrices[..., i, j, :] for i in range(3) for j in range(i, 3)], dim=-2)
+
+
 def outer(vectors: Tensor) -> Tensor:
     """The six entries (..., 6, N) of v v^T for vectors (..., 3, N)."""
     x, y, z = vectors.unbind(-2)

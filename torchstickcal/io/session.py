@@ -15,7 +15,8 @@ from torch import Tensor
 from torchstickcal.errors import CalibrationError, FileFormatError
 from torchstickcal.files import atomic_path
 from torchstickcal.io import safe_pickle
-from torchstickcal.observations import Observations, Stick
+from torchstickcal.observations import Observations
+from torchstickcal.stick import Stick
 
 SPORTS_STICK_SYN_JOINTS = (
     "pelvis", "spine", "right_shoulder", "left_shoulder", "neck", "head", "head_top",

@@ -12,7 +12,8 @@ from torchstickcal.errors import ObservationError
 from torchstickcal.geometry.cameras import Intrinsics
 from torchstickcal.model.measurements import Measurements
 from torchstickcal.model.unknowns import RigUnknowns
-from torchstickcal.observations import Observations, Stick
+from torchstickcal.observations import Observations
+from torchstickcal.stick import Stick
 
 
 @dataclass(frozen=True)

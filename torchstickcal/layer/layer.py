@@ -17,11 +17,11 @@ from torchstickcal.layer.inputs import LayerInputs
 from torchstickcal.layer.result import LayerResult
 from torchstickcal.model.state import State
 from torchstickcal.model.unknowns import RigUnknowns
-from torchstickcal.observations import Stick
 from torchstickcal.pipeline.adjust import Adjustment, adjust_cameras, adjust_points, begin
 from torchstickcal.pipeline.attach import attach_gradients
 from torchstickcal.pipeline.run import Run
 from torchstickcal.solvers.gradients import GradientMode, gradient_mode
+from torchstickcal.stick import Stick
 from torchstickcal.workers import map_on_workers
 
 _KEYPOINTS_AT_ONCE = 32_000

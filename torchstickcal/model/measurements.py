@@ -17,7 +17,8 @@ from torch import Tensor
 from torchstickcal.geometry.cameras import Intrinsics
 from torchstickcal.model.state import State
 from torchstickcal.model.unknowns import Columns, ImageMotion, RigUnknowns
-from torchstickcal.observations import Observations, point_index
+from torchstickcal.observations import Observations
+from torchstickcal.stick import point_index
 
 _CHUNK_KEYPOINTS = {"cpu": 32_000, "cuda": 1_000_000}
 """Keypoints worked on at a time. What a CPU works on stays in its cache; elsewhere an operation should be worth its launch."""

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from torchstickcal.losses import SmoothnessLoss
-from torchstickcal.losses.base import combined, consecutive
+from torchstickcal.losses.track import combined, consecutive
 from torchstickcal.model.measurements import Measurements
 from torchstickcal.model.state import State
 

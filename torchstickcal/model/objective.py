@@ -17,7 +17,9 @@ from torch import Tensor
 from torchstickcal.geometry import se3
 from torchstickcal.geometry.cameras import Intrinsics, PixelMap
 from torchstickcal.losses import CameraPointLoss, FrameLoss, Loss, TrackLoss
-from torchstickcal.losses.base import CameraPointTerms, FrameTerms, TrackTerms, UnknownTerms
+from torchstickcal.losses.camera_point import CameraPointTerms, UnknownTerms
+from torchstickcal.losses.frame import FrameTerms
+from torchstickcal.losses.track import TrackTerms
 from torchstickcal.model.measurements import Measurements
 from torchstickcal.model.state import State
 from torchstickcal.model.unknowns import Columns, ImageMotion, RigUnknowns

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from torchstickcal.errors import FileFormatError
 from torchstickcal.io.session import Truth, read_npz, write_npz
-from torchstickcal.observations import Observations, Stick
+from torchstickcal.observations import Observations
 from torchstickcal.simulate.athlete import Motion
 from torchstickcal.simulate.clocks import Clocks, exposed_points
 from torchstickcal.simulate.cube import Cube, CubeViews
@@ -21,6 +21,7 @@ from torchstickcal.simulate.paths import Path
 from torchstickcal.simulate.regimes import Regime, Views, apply
 from torchstickcal.simulate.rigs import CameraRig, Lens, camera_rig
 from torchstickcal.simulate.skeleton import JOINTS, STANDING_HEIGHT_M, Skeleton
+from torchstickcal.stick import Stick
 
 Array = NDArray[np.float64]
 

@@ -22,8 +22,8 @@ import torch
 from torch import Tensor
 
 from torchstickcal.geometry import se3
-from torchstickcal.geometry.symmetric import DIAGONAL, IDENTITY, inverse_diagonal, raised
-from torchstickcal.losses.base import CameraPointTerms, UnknownTerms, six_entries
+from torchstickcal.geometry.symmetric import DIAGONAL, IDENTITY, inverse_diagonal, raised, six_entries
+from torchstickcal.losses.camera_point import CameraPointTerms, UnknownTerms
 from torchstickcal.model.objective import PRIOR, Objective
 from torchstickcal.model.state import State
 from torchstickcal.model.unknowns import Columns, RigUnknowns

@@ -1,0 +1,114 @@
+"""Losses that couple some points of one frame."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+from torch.autograd import forward_ad
+
+from torchstickcal.losses.base import Loss, tangent
+
+
+class FrameTerms(NamedTuple):
+    """A frame loss, linearised at F frames and G groups of k points."""
+
+    cost: Tensor
+    """(...): the loss"""
+    gradient: Tensor
+    """(..., k, 3, F, G): half the derivative by each point of the group"""
+    hessian: Tensor
+    """(..., k, k, 3, 3, F, G): the blocks between the points of the group"""
+
+
+class FrameLoss(Loss, ABC):
+    """Couples some points of one frame: lengths, angles, whatever is known of a body or an implement."""
+
+    @abstractmethod
+    def groups(self, sticks: Tensor) -> Tensor:
+        """The points that take part: (G, k), k different points for each of G groups.
+
+        Args:
+            sticks: (S, 2), the ends of the session's sticks.
+        """
+
+    @abstractmethod
+    def residuals(self, points: Tensor, lengths_m: Tensor) -> Tensor:
+        """Residuals (..., G, m), not yet divided by sigma, metres or whatever unit sigma has.
+
+        Args:
+            points: the groups' points, (..., G, k, 3), metres.
+            lengths_m: given lengths of the session's sticks, (..., S).
+        """
+
+    def of_session(self, points: Tensor, sticks: Tensor, lengths_m: Tensor) -> Tensor:
+        """The loss, a scalar, of a session's points (..., F, P, 3), NaN for points that are not known.
+
+        Args:
+            points: metres.
+            sticks: (S, 2), the ends of its sticks.
+            lengths_m: their given lengths, (..., 1, S).
+        """
+        grouped = points[..., self.groups(sticks), :]
+        known = grouped.isfinite().all(-1).all(-1)
+        squared = self._squared(grouped, known, lengths_m)
+        return self.total(squared * self.information(squared))
+
+    def linearise(self, points: Tensor, sticks: Tensor, lengths_m: Tensor, active: Tensor, exact: bool = False) -> FrameTerms:
+        """The terms, here by automatic differentiation of the residuals.
+
+        Args:
+            points: (..., 3, F, P), metres.
+            sticks: (S, 2), the ends of the session's sticks.
+            lengths_m: their given lengths, (..., 1, S).
+            active: (..., F, P), True for points that are known.
+            exact: whether the blocks are those of the exact Hessian, with the curvature of kernel and residuals.
+        """
+        groups = self.groups(sticks)
+        known = active[..., groups].all(-1)
+        with torch.enable_grad():
+            at = _in_general_position(points[..., groups].movedim(-4, -1), known).detach().requires_grad_()
+            residuals = self.residuals(at, lengths_m.detach())
+            rows = [torch.autograd.grad(row.sum(), at, retain_graph=True)[0] for row in residuals.unbind(-1)]
+        whitened = torch.where(known, residuals.detach().square().sum(-1), 0.0)
+        whitened = whitened * self.information(whitened)
+        weights = self.weight * self.information(whitened) * known * self.kernel.weight(whitened)
+        jacobian = torch.stack(rows, dim=-3)
+        gradient = torch.einsum("...fgm,...fgmki,...fg->...kifg", residuals.detach(), jacobian, weights)
+        if exact:
+            hessian = self._exact_hessian(at, known, lengths_m)
+        else:
+            hessian = torch.einsum("...fgmki,...fgmlj,...fg->...klijfg", jacobian, jacobian, weights)
+        return FrameTerms(self.total(whitened, over=2), gradient, hessian)
+
+    def slope(self, points: Tensor, moved: Tensor, sticks: Tensor, lengths_m: Tensor, active: Tensor) -> Tensor:
+        """Half the derivative of the loss where the points move by (..., 3, F, P), summed; differentiable."""
+        groups = self.groups(sticks)
+        known = active[..., groups].all(-1)
+        at, along = (values[..., groups].movedim(-4, -1) for values in (points, moved))
+        with forward_ad.dual_level():
+            squared = self._squared(forward_ad.make_dual(at, along), known, lengths_m)
+            return tangent(self.total(squared * self.information(squared))) / 2
+
+    @torch.enable_grad()
+    def _exact_hessian(self, grouped: Tensor, known: Tensor, lengths_m: Tensor) -> Tensor:
+        """Half the second derivatives of the loss, blocks (..., k, k, 3, 3, F, G)."""
+        squared = self._squared(grouped, known, lengths_m)
+        value = self.total(squared * self.information(squared))
+        (gradient,) = torch.autograd.grad(value / 2, grouped, create_graph=True)
+        rows = [torch.autograd.grad(row.sum(), grouped, retain_graph=True)[0] for row in gradient.flatten(-2).unbind(-1)]
+        blocks = torch.stack(rows, dim=-3).unflatten(-3, grouped.shape[-2:])
+        return torch.einsum("...fgkilj->...klijfg", blocks)
+
+    def _squared(self, grouped: Tensor, known: Tensor, lengths_m: Tensor) -> Tensor:
+        """Squared residuals (..., G) of points (..., G, k, 3), zero for groups that are not known whole."""
+        residuals = self.residuals(_in_general_position(grouped, known), lengths_m)
+        return torch.where(known, residuals.square().sum(-1), 0.0)
+
+
+def _in_general_position(points: Tensor, known: Tensor) -> Tensor:
+    """Points (..., G, k, 3), those of groups that are not known whole replaced by points with which any residual exists."""
+    order = torch.arange(1.0, points.shape[-2] + 1).to(points)
+    return torch.where(known[..., None, None], points, torch.stack([order, order.square(), order.pow(3)], dim=-1))
