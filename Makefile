@@ -2,16 +2,24 @@ PYTHON ?= python3
 VENV := .venv
 INSTALLED := $(VENV)/.installed
 
-.PHONY: demo test test-slow lint clean
+.PHONY: demo test quick test-slow lint clean
+
+# The matrices are small: one thread computes faster than several that wait for each other.
+PYTEST := OMP_NUM_THREADS=1 $(VENV)/bin/python -m pytest
+QUICK := architecture calibrate cameras config elimination extrinsics initialise io layer losses metrics noise observations se3 \
+	solvers trajectories workers
 
 demo: $(INSTALLED)
 	$(VENV)/bin/torchstickcal demo --out demo
 
 test: $(INSTALLED)
-	$(VENV)/bin/python -m pytest
+	$(PYTEST)
+
+quick: $(INSTALLED)
+	$(PYTEST) $(QUICK:%=tests/test_%.py)
 
 test-slow: $(INSTALLED)
-	$(VENV)/bin/python -m pytest -m slow
+	$(PYTEST) -m slow
 
 lint: $(INSTALLED)
 	$(VENV)/bin/ruff check .
