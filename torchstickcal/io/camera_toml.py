@@ -23,7 +23,7 @@ from torchstickcal.io.rig import Rig
 from torchstickcal.result import Calibration
 
 _NAME = "pose2sim"
-_DESCRIPTION = "calibration.toml of Pose2Sim or aniposelib, in metres"
+_DESCRIPTION = "cameras of Pose2Sim or aniposelib, in metres (.toml)"
 _NOT_CAMERAS = {"metadata", "capture_volume", "charuco", "checkerboard"}
 _CAMERA_TABLE = re.compile(rb"^\[[^\[\].]+\]\s*\n(?:(?!\[).*\n)*?matrix\s*=", re.MULTILINE)
 """A top-level table with a camera matrix."""

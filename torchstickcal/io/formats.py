@@ -353,7 +353,7 @@ def reading(path: str | Path, expected: str) -> Iterator[None]:
     except Exception as error:
         got = f"no {error}" if isinstance(error, KeyError) else f"{type(error).__name__}: {error}"
         raise FileFormatError(
-            "a file is damaged or not of the expected format", where=str(path), got=" ".join(got.split()), expected=expected
+            "a file is damaged or not of the expected format", where=str(path), got=got, expected=expected
         ) from error
 
 
