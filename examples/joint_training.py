@@ -44,8 +44,7 @@ from torch import Tensor, nn
 from torch.nn.parallel import DistributedDataParallel
 from torch.utils.tensorboard import SummaryWriter
 
-from torchstickcal import CalibrationLayer, Config, load_config
-from torchstickcal.layer.layer import LayerResult
+from torchstickcal import CalibrationLayer, Config, LayerResult, load_config
 from torchstickcal.losses import ReprojectionSettings, StickLengthSettings, reprojection_residuals
 from torchstickcal.metrics import pose_errors
 

@@ -203,8 +203,7 @@ class CameraPointLoss(Loss, ABC):
         seen = keypoints.isfinite().all(-1, keepdim=True) & points.isfinite().all(-1, keepdim=True).unsqueeze(-4)
         points_cam = projection.to_cameras(points.nan_to_num(), rotations, translations)
         points_cam = torch.where(seen, points_cam, points.new_tensor([0.0, 0.0, 1.0]))
-        keypoints = torch.where(seen, keypoints, 0.0)
-        found = self.residuals(points_cam.flatten(-3, -2), keypoints.flatten(-3, -2), intrinsics)
+        found = self.residuals(points_cam.flatten(-3, -2), keypoints.nan_to_num().flatten(-3, -2), intrinsics)
         found = found.unflatten(-2, keypoints.shape[-3:-1])
         return torch.where(seen, found, torch.zeros_like(found))
 

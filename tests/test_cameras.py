@@ -1,4 +1,4 @@
-"""Intrinsics against OpenCV and against autograd."""
+"""Intrinsics against OpenCV, kornia and autograd."""
 
 from __future__ import annotations
 
@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 import torch
 
-from torchstickcal import Intrinsics
+from torchstickcal import Intrinsics, ObservationError
+from torchstickcal.geometry import projection
 
 MATRIX = torch.tensor([[1400.0, 2.0, 960.0], [0.0, 1390.0, 540.0], [0.0, 0.0, 1.0]], dtype=torch.float64)
 LENSES = {
@@ -15,6 +16,8 @@ LENSES = {
     "four": ([-0.3, 0.1, 0.001, -0.002], False),
     "five": ([-0.33, 0.15, -0.0013, 0.003, -0.03], False),
     "eight": ([-0.2, 0.05, 0.001, -0.001, 0.01, 0.1, -0.02, 0.003], False),
+    "thin prism": ([-0.2, 0.05, 0.001, -0.001, 0.01, 0.1, -0.02, 0.003, 0.002, -0.001, 0.0015, 0.0005], False),
+    "tilted": ([-0.2, 0.05, 0.001, -0.001, 0.01, 0.1, -0.02, 0.003, 0.002, -0.001, 0.0015, 0.0005, 0.03, -0.02], False),
     "fisheye": ([-0.02, 0.01, -0.004, 0.001], True),
 }
 
@@ -44,6 +47,31 @@ def test_projection_is_opencvs(lens: str):
             distorted, _ = cv2.projectPoints(seen, np.zeros(3), np.zeros(3), np.eye(3), np.array(coefficients or [0.0] * 5))
             expected = np.c_[distorted[:, 0], np.ones(len(distorted))] @ matrix[:2].T
         np.testing.assert_allclose(camera.numpy(), expected, atol=1e-9)
+
+
+@pytest.mark.parametrize("lens", LENSES)
+def test_projection_is_kornias(lens: str):
+    torch.testing.assert_close(projection.project(points(), cameras(lens)), cameras(lens).project(points()), rtol=0, atol=1e-11)
+
+
+def test_projection_by_kornia_has_a_gradient_by_the_skew():
+    matrix = torch.eye(3, dtype=torch.float64)[None].requires_grad_()
+    projection.project(points()[:1], Intrinsics(matrix)).sum().backward()
+    assert matrix.grad is not None
+    expected = (points()[:1, :, 1] / points()[:1, :, 2]).sum()
+    assert float(matrix.grad[0, 0, 1]) == pytest.approx(float(expected))
+
+
+def test_conversion_to_and_from_kornias_camera():
+    size, rotations = torch.tensor([1920, 1080]), torch.linalg.qr(points()[:, :3])[0]
+    perfect = Intrinsics(MATRIX.expand(2, 3, 3) * (1 - torch.tensor([[0.0, 1, 0], [0, 0, 0], [0, 0, 0]])))
+    camera = perfect.to_kornia(size, rotations, points()[:, 0])
+    seen = projection.to_cameras(points()[:1], rotations, points()[:, 0])[:, 0]
+    torch.testing.assert_close(camera.project(points()[:1].expand(2, -1, -1)), perfect.project(seen), rtol=0, atol=1e-9)
+    assert (camera.width.tolist(), camera.height.tolist()) == ([1920, 1920], [1080, 1080])
+    torch.testing.assert_close(Intrinsics.from_kornia(camera).matrix, perfect.matrix)
+    with pytest.raises(ObservationError, match=r"distorted lens does not fit.*Undistort the keypoints"):
+        cameras("four").to_kornia(size)
 
 
 @pytest.mark.parametrize("lens", LENSES)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from torchstickcal import Extrinsics, ObservationError
+from torchstickcal import Extrinsics, Intrinsics, ObservationError
 from torchstickcal.geometry import se3
 from torchstickcal.losses import ReprojectionLoss
 
@@ -54,6 +54,19 @@ def test_state_dict_round_trip():
     other = Extrinsics(torch.eye(3, dtype=torch.float64).expand(4, 3, 3), torch.zeros(4, 3, dtype=torch.float64))
     other.load_state_dict(extrinsics.state_dict())
     torch.testing.assert_close(other(), extrinsics())
+
+
+def test_conversion_to_and_from_kornias_transforms():
+    extrinsics = Extrinsics(*poses())
+    extrinsics.tangents.data.normal_(std=0.3)
+    transforms = extrinsics.to_kornia()
+    points = torch.randn(4, 3, dtype=torch.float64)
+    rotations, translations = extrinsics()
+    expected = (rotations @ points[..., None])[..., 0] + translations
+    torch.testing.assert_close(transforms * points, expected)
+    torch.testing.assert_close(Extrinsics.from_kornia(transforms)(), (rotations, translations))
+    cameras = Intrinsics(torch.eye(3, dtype=torch.float64).expand(4, 3, 3)).to_kornia(torch.tensor([10, 10]), *extrinsics())
+    torch.testing.assert_close(Extrinsics.from_kornia(cameras)(), (rotations, translations))
 
 
 def test_an_optimiser_of_torch_finds_the_poses(perfect):

@@ -9,8 +9,16 @@ import torch
 from torch import Tensor
 from torch.utils.checkpoint import checkpoint
 
-from torchstickcal import CalibrationLayer, GaussNewton, Implicit, Intrinsics, ObservationError, Unrolled, calibrate
-from torchstickcal.layer.layer import LayerResult
+from torchstickcal import (
+    CalibrationLayer,
+    GaussNewton,
+    Implicit,
+    Intrinsics,
+    LayerResult,
+    ObservationError,
+    Unrolled,
+    calibrate,
+)
 from torchstickcal.simulate import Noise, golf_session
 
 OBSERVATIONS, TRUTH = golf_session(cameras=4, frames=12, noise=Noise(sigma_px=2.0, missing=0.05))

@@ -10,8 +10,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from torchstickcal import CalibrationLayer, ObservationError, calibrate
-from torchstickcal.layer.layer import LayerResult
+from torchstickcal import CalibrationLayer, LayerResult, ObservationError, calibrate
 from torchstickcal.metrics import pose_errors
 from torchstickcal.model.measurements import Measurements
 from torchstickcal.pipeline.synchronise import Exposures, common_clock

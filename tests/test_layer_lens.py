@@ -14,11 +14,11 @@ from torchstickcal import (
     ConfigError,
     GaussNewton,
     Intrinsics,
+    LayerResult,
     ObservationError,
     Unrolled,
     calibrate,
 )
-from torchstickcal.layer.layer import LayerResult
 from torchstickcal.simulate import Noise, golf_session
 
 OBSERVATIONS, _ = golf_session(cameras=4, frames=12, noise=Noise(sigma_px=1.0, missing=0.05))

@@ -14,7 +14,8 @@ if TYPE_CHECKING:
     from torchstickcal.errors import CalibrationError, ConfigError, FileFormatError, ObservationError, RigError
     from torchstickcal.extrinsics import Extrinsics
     from torchstickcal.geometry.cameras import Intrinsics
-    from torchstickcal.layer.layer import CalibrationLayer, LayerResult
+    from torchstickcal.layer.layer import CalibrationLayer
+    from torchstickcal.layer.result import LayerResult
     from torchstickcal.observations import Observations, Stick
     from torchstickcal.pipeline.calibrate import Callback, calibrate
     from torchstickcal.result import Calibration
@@ -36,7 +37,7 @@ _HOMES = {
     "GradientMode": "solvers.gradients",
     "Implicit": "solvers.gradients",
     "Intrinsics": "geometry.cameras",
-    "LayerResult": "layer.layer",
+    "LayerResult": "layer.result",
     "ObservationError": "errors",
     "Observations": "observations",
     "RigError": "errors",

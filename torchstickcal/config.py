@@ -103,6 +103,13 @@ class Config:
         synchronise: whether ``auto`` may estimate clocks.
         max_offset_s: largest time offset from the first camera that is searched for, seconds. Where the motion repeats itself,
             choose less than half its period.
+
+    Example:
+        >>> config = load_config({"extends": "default", "stages": {"metric": {"stick_length": {"sigma_m": 0.003}}}})
+        >>> list(config.stages)
+        ['unscaled', 'metric', 'refined', 'trajectories']
+        >>> config.stages["metric"].losses["stick_length"]
+        StickLengthSettings(sigma_m=0.003, weight=1.0)
     """
 
     stages: dict[str, Stage]
@@ -118,7 +125,12 @@ class Config:
 
 
 def config_names() -> list[str]:
-    """The names of the configurations shipped with the package."""
+    """The names of the configurations shipped with the package.
+
+    Example:
+        >>> "default" in config_names()
+        True
+    """
     files = resources.files("torchstickcal.configs").iterdir()
     return sorted(Path(file.name).stem for file in files if file.name.endswith(".toml"))
 
@@ -126,8 +138,17 @@ def config_names() -> list[str]:
 def load_config(config: str | Path | Mapping[str, Any] | Config = "default") -> Config:
     """A configuration from its name, from a TOML file, from a mapping of the same keys, or as it is.
 
+    Args:
+        config: any of these. A mapping or a file that ``extends`` a configuration states only what differs from it.
+
     Raises:
         ConfigError: for an unknown name, an unknown key (with the nearest known one), or an unusable value.
+
+    Example:
+        >>> load_config("lbfgs").solver
+        'lbfgs'
+        >>> load_config({"extends": "default", "refine": ["focal", "radial"]}).refine
+        ['focal', 'radial']
     """
     if isinstance(config, Config):
         return config

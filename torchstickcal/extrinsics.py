@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import torch
+from kornia.geometry.camera import PinholeCamera
 from kornia.geometry.liegroup import Se3
 from torch import Tensor, nn
 
@@ -12,12 +13,25 @@ from torchstickcal.errors import ObservationError
 class Extrinsics(nn.Module):
     """World-to-camera transforms ``T = T_anchor Exp(tangent)`` of C cameras; the first one is fixed.
 
-    The tangents are ordered (translation, rotation) and live on the world's side of the transform. They start at zero, so
-    any optimiser of torch.optim can drive them; :meth:`reanchor` folds them into the anchor when they have grown.
+    The tangents are ordered (translation, rotation) and act on the world's side of the transform. They start at zero, and any
+    optimiser of torch.optim can change them. :meth:`reanchor` moves the anchor to the present transforms when they have grown.
 
     Args:
         rotations: (C, 3, 3), world to camera.
-        translations: (C, 3), metres.
+        translations: (C, 3), world to camera, metres.
+
+    Raises:
+        ObservationError: if the shapes do not fit.
+
+    Example:
+        >>> import torch
+        >>> extrinsics = Extrinsics(torch.eye(3).repeat(2, 1, 1), torch.zeros(2, 3))
+        >>> optimiser = torch.optim.SGD(extrinsics.parameters(), lr=0.1)
+        >>> rotations, translations = extrinsics()
+        >>> (translations[1] - torch.tensor([1.0, 0.0, 0.0])).square().sum().backward()
+        >>> optimiser.step()
+        >>> extrinsics()[1][1].detach()
+        tensor([0.2000, 0.0000, 0.0000])
     """
 
     anchor_rotations: Tensor
@@ -41,6 +55,19 @@ class Extrinsics(nn.Module):
         moved = self.compose(self.tangents[1:])
         rotations = torch.cat([self.anchor_rotations[:1], moved[0]])
         return rotations, torch.cat([self.anchor_translations[:1], moved[1]])
+
+    def to_kornia(self) -> Se3:
+        """The C transforms, world to camera, as kornia's."""
+        rotations, translations = self()
+        pose = torch.cat([rotations, translations[..., None]], dim=-1)
+        last_row = torch.tensor([[0.0, 0.0, 0.0, 1.0]]).to(pose).expand(len(pose), 1, 4)
+        return Se3.from_matrix(torch.cat([pose, last_row], dim=1))
+
+    @staticmethod
+    def from_kornia(transforms: Se3 | PinholeCamera) -> Extrinsics:
+        """Transforms, world to camera, from kornia's, or from the poses of its cameras."""
+        matrix = transforms.extrinsics if isinstance(transforms, PinholeCamera) else transforms.matrix()
+        return Extrinsics(matrix[:, :3, :3], matrix[:, :3, 3])
 
     def compose(self, tangents: Tensor) -> tuple[Tensor, Tensor]:
         """The poses of all cameras but the first at tangents (C - 1, 6) from the anchor."""

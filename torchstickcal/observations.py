@@ -104,25 +104,37 @@ class Observations:
 
     Args:
         keypoints: pixels (C, F, P, 2) as detected (distorted), NaN where a point was not seen.
-        intrinsics: camera matrices, (C, 3, 3) or one (3, 3) shared by all; None if they are to be found, for which the image
-            size is needed. The principal point is then taken to be the image's centre.
+        intrinsics: camera matrices, (C, 3, 3) or one (3, 3) for all; None if they are to be estimated, for which the image size
+            is needed. The principal point is then taken to be the centre of the image.
         sticks: one stick or several; empty if the scale comes from elsewhere.
-        distortion: (C, D) or (D,), OpenCV's order, D of 4, 5 or 8; None for perfect lenses.
-        confidence: (C, F, P) in [0, 1], the weight of a keypoint: its variance is divided by it. 0 is not seen.
+        distortion: (C, D) or (D,), OpenCV's order, D of 4, 5, 8, 12 or 14; None for perfect lenses.
+        confidence: (C, F, P) in [0, 1], the weight of a keypoint: its variance is divided by it. 0 means not seen.
         image_size: width and height in pixels, (C, 2) or (2,).
         fps: frames per second.
         point_names: P names. camera_names: C names.
         fisheye: whether ``distortion`` (D = 4) is of OpenCV's fisheye model.
-        timestamps: (C, F) or (F,), seconds, when each camera's frames begin, for cameras of different frame rates or with
-            dropped frames; NaN where a camera has no frame. None for frames that begin together.
+        timestamps: (C, F) or (F,), seconds at which each camera's frames begin, for cameras of different frame rates or with
+            dropped frames; NaN where a camera has no frame. None for synchronised frames.
         readout_s: time from the first row of an image to the last, of rolling shutters, seconds; None for none. Needs image
             size and frame rate.
 
-    Arrays, lists and tensors are accepted and kept as tensors with the given values, shape and dtype; results of a
-    calibration come back in the dtype and on the device of ``keypoints``.
+    Arrays, lists and tensors are accepted and kept as tensors with the given values, shape and dtype. The results of a
+    calibration have the dtype and device of ``keypoints``.
 
     Raises:
-        ObservationError: for anything that cannot be calibrated from.
+        ObservationError: for anything that cannot be used.
+
+    Example:
+        >>> import numpy as np
+        >>> rng = np.random.default_rng(0)
+        >>> observations = Observations(
+        ...     rng.uniform(0, 1000, (3, 50, 4, 2)),  # 3 cameras, 50 frames, 4 points
+        ...     [[1000, 0, 960], [0, 1000, 540], [0, 0, 1]],
+        ...     Stick("grip", "head", 1.0),
+        ...     point_names=["hip", "wrist", "grip", "head"],
+        ... )
+        >>> observations.num_cameras, observations.num_frames, observations.sticks[0].ends
+        (3, 50, (2, 3))
     """
 
     keypoints: Tensor
@@ -280,7 +292,7 @@ class Observations:
                     expected="[[fx, s, cx], [0, fy, cy], [0, 0, 1]] with fx, fy > 0, in pixels",
                 )
         if self.distortion is not None:
-            counts = (4,) if self.fisheye else (4, 5, 8)
+            counts = (4,) if self.fisheye else (4, 5, 8, 12, 14)
             shape = tuple(self.distortion.shape)
             if shape[-1:] not in {(n,) for n in counts} or shape[:-1] not in {(), (cameras,)}:
                 raise ObservationError(

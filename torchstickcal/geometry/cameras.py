@@ -1,18 +1,24 @@
-"""Camera intrinsics: pinhole with OpenCV's lens models, exact in both directions.
+"""Camera intrinsics: pinhole with OpenCV's lens models, exact in both directions, with derivatives in closed form.
 
-Pixels have their centres at integer coordinates, cameras look along +z (OpenCV). The two lens models of OpenCV are
-covered: rational with tangential terms (4, 5 or 8 coefficients ``k1 k2 p1 p2 [k3 [k4 k5 k6]]``) and the fisheye model of
-Kannala and Brandt (4 coefficients). Both have a symmetric 2 x 2 Jacobian, kept as its three distinct entries.
+Pixels have their centres at integer coordinates, cameras look along +z (OpenCV). Both lens models of OpenCV are covered: the
+standard one with 4, 5, 8, 12 or 14 coefficients ``k1 k2 p1 p2 [k3 [k4 k5 k6 [s1 s2 s3 s4 [tx ty]]]]`` (radial, tangential,
+thin prism, tilted sensor), and the fisheye model of Kannala and Brandt with 4. The same projection from kornia's functions, for
+autograd, is :mod:`torchstickcal.geometry.projection`.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import torch
 from torch import Tensor
+
+from torchstickcal.errors import ObservationError
+
+if TYPE_CHECKING:
+    from kornia.geometry.camera import PinholeCamera
 
 _MAX_INVERSE_DEPTH = 1e6
 _FOLD_SEARCH_RADIUS = 8.0
@@ -28,6 +34,7 @@ class Distorted(NamedTuple):
     v: Tensor
     du_du: Tensor
     du_dv: Tensor
+    dv_du: Tensor
     dv_dv: Tensor
 
 
@@ -54,8 +61,18 @@ class Intrinsics:
 
     Args:
         matrix: camera matrices K, (..., C, 3, 3), pixels.
-        distortion: lens coefficients in OpenCV's order, (..., C, 4 | 5 | 8), or None for a perfect lens.
+        distortion: lens coefficients in OpenCV's order, (..., C, 4 | 5 | 8 | 12 | 14), or None for a perfect lens.
         fisheye: whether ``distortion`` (..., C, 4) is of OpenCV's fisheye model.
+
+    Example:
+        >>> import torch
+        >>> matrix = torch.tensor([[1000.0, 0, 960], [0, 1000, 540], [0, 0, 1]])
+        >>> cameras = Intrinsics(matrix.expand(2, 3, 3), torch.tensor([[-0.1, 0, 0, 0]]).expand(2, 4))
+        >>> pixels = cameras.project(torch.tensor([0.2, 0.1, 2.0]).expand(2, 1, 3))
+        >>> pixels[0, 0]
+        tensor([1059.8750,  589.9375])
+        >>> cameras.undistort(pixels)[0, 0]
+        tensor([0.1000, 0.0500])
     """
 
     matrix: Tensor
@@ -74,6 +91,51 @@ class Intrinsics:
     def batched(self) -> Intrinsics:
         """The cameras of one session as those of a batch of one."""
         return Intrinsics(self.matrix[None], None if self.distortion is None else self.distortion[None], self.fisheye)
+
+    def to_kornia(
+        self, image_size: Tensor, rotations: Tensor | None = None, translations: Tensor | None = None
+    ) -> PinholeCamera:
+        """The C cameras of one session as kornia's.
+
+        Args:
+            image_size: width and height, (2,) or (C, 2), pixels.
+            rotations: (C, 3, 3), world to camera; None for the identity.
+            translations: (C, 3), world to camera, metres; None for zero.
+
+        Raises:
+            ObservationError: if the lenses are distorted, which kornia's camera cannot hold.
+
+        Example:
+            >>> import torch
+            >>> matrix = torch.tensor([[1000.0, 0, 960], [0, 1000, 540], [0, 0, 1]])
+            >>> camera = Intrinsics(matrix[None]).to_kornia(torch.tensor([1920, 1080]))
+            >>> camera.project(torch.tensor([[[0.2, 0.1, 2.0]]]))
+            tensor([[[1060.,  590.]]])
+        """
+        from kornia.geometry.camera import PinholeCamera
+
+        if self.distortion is not None and bool(self.distortion.any()):
+            raise ObservationError(
+                "a distorted lens does not fit into kornia's PinholeCamera",
+                where="Intrinsics.to_kornia",
+                got="distortion that is not zero",
+                expected="perfect lenses",
+                remedy="Undistort the keypoints (Intrinsics.undistort), then convert Intrinsics(matrix) without distortion.",
+            )
+        matrix = torch.eye(4).to(self.matrix).repeat(len(self.matrix), 1, 1)
+        pose = matrix.clone()
+        matrix[:, :3, :3] = self.matrix
+        if rotations is not None:
+            pose[:, :3, :3] = rotations
+        if translations is not None:
+            pose[:, :3, 3] = translations
+        width, height = image_size.to(self.matrix).expand(len(matrix), 2).unbind(-1)
+        return PinholeCamera(matrix, pose, height, width)
+
+    @staticmethod
+    def from_kornia(camera: PinholeCamera) -> Intrinsics:
+        """The intrinsics of kornia's cameras."""
+        return Intrinsics(camera.camera_matrix)
 
     @property
     def focal_px(self) -> Tensor:
@@ -101,9 +163,9 @@ class Intrinsics:
         lens = self.distort_with_jacobian(u, v)
         return PixelMap(
             *self._to_pixels(lens.u, lens.v),
-            dx_du=fx * lens.du_du + skew * lens.du_dv,
+            dx_du=fx * lens.du_du + skew * lens.dv_du,
             dx_dv=fx * lens.du_dv + skew * lens.dv_dv,
-            dy_du=fy * lens.du_dv,
+            dy_du=fy * lens.dv_du,
             dy_dv=fy * lens.dv_dv,
         )
 
@@ -121,7 +183,10 @@ class Intrinsics:
         return uu, uv, vv
 
     def pixels_by_radial(self, u: Tensor, v: Tensor, order: int) -> tuple[Tensor, Tensor]:
-        """Derivatives of the pixels of normalised coordinates (..., C, N) by the radial coefficient k1 (order 1) or k2."""
+        """Derivatives of the pixels of normalised coordinates (..., C, N) by the radial coefficient k1 (order 1) or k2.
+
+        Not for tilted sensors.
+        """
         fx, skew, _, fy, _ = self._pixel_map(u.ndim)
         r2 = u * u + v * v
         if self.fisheye:
@@ -130,7 +195,7 @@ class Intrinsics:
         else:
             growth = r2**order
             if self._has_denominator:
-                *_, k4, k5, k6 = self._coefficients(u.ndim)
+                k4, k5, k6 = self._coefficients(u.ndim)[5:8]
                 growth = growth / (1 + r2 * (k4 + r2 * (k5 + r2 * k6)))
         return (fx * u + skew * v) * growth, fy * v * growth
 
@@ -143,24 +208,67 @@ class Intrinsics:
             return scale * u, scale * v
         radial, _, p1, p2, r2 = self._rational(u, v)
         uv = 2 * u * v
-        return u * radial + p1 * uv + p2 * (r2 + 2 * u * u), v * radial + p1 * (r2 + 2 * v * v) + p2 * uv
+        distorted = u * radial + p1 * uv + p2 * (r2 + 2 * u * u), v * radial + p1 * (r2 + 2 * v * v) + p2 * uv
+        if self._has_prism:
+            s1, s2, s3, s4 = self._coefficients(u.ndim)[8:12]
+            distorted = distorted[0] + r2 * (s1 + r2 * s2), distorted[1] + r2 * (s3 + r2 * s4)
+        return self._tilted(*distorted)[:2] if self.is_tilted else distorted
 
     def distort_with_jacobian(self, u: Tensor, v: Tensor) -> Distorted:
-        """:meth:`distort` with its symmetric Jacobian."""
+        """:meth:`distort` with its Jacobian."""
         if self.distortion is None:
             one, zero = torch.ones_like(u), torch.zeros_like(u)
-            return Distorted(u, v, one, zero, one)
+            return Distorted(u, v, one, zero, zero, one)
         if self.fisheye:
             scale, slope = self._fisheye(u, v)
-            return Distorted(scale * u, scale * v, scale + slope * u * u, slope * u * v, scale + slope * v * v)
+            mixed = slope * u * v
+            return Distorted(scale * u, scale * v, scale + slope * u * u, mixed, mixed, scale + slope * v * v)
         radial, slope, p1, p2, r2 = self._rational(u, v)
         uv = 2 * u * v
-        return Distorted(
+        mixed = slope * uv + 2 * p1 * u + 2 * p2 * v
+        found = Distorted(
             u * radial + p1 * uv + p2 * (r2 + 2 * u * u),
             v * radial + p1 * (r2 + 2 * v * v) + p2 * uv,
             radial + 2 * slope * u * u + 2 * p1 * v + 6 * p2 * u,
-            slope * uv + 2 * p1 * u + 2 * p2 * v,
+            mixed,
+            mixed,
             radial + 2 * slope * v * v + 6 * p1 * v + 2 * p2 * u,
+        )
+        if self._has_prism:
+            found = self._with_prism(u, v, r2, found)
+        return self._tilted_with_jacobian(found) if self.is_tilted else found
+
+    def _with_prism(self, u: Tensor, v: Tensor, r2: Tensor, found: Distorted) -> Distorted:
+        """Add the thin-prism terms at normalised coordinates."""
+        s1, s2, s3, s4 = self._coefficients(u.ndim)[8:12]
+        by_u, by_v = 2 * (s1 + 2 * r2 * s2), 2 * (s3 + 2 * r2 * s4)
+        return Distorted(
+            found.u + r2 * (s1 + r2 * s2),
+            found.v + r2 * (s3 + r2 * s4),
+            found.du_du + by_u * u,
+            found.du_dv + by_u * v,
+            found.dv_du + by_v * u,
+            found.dv_dv + by_v * v,
+        )
+
+    def _tilted(self, u: Tensor, v: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Distorted coordinates on a tilted sensor, and the depth by which they were divided."""
+        xx, xy, xz, yx, yy, yz, zx, zy, zz = _broadcast(self._tilt.flatten(-2).movedim(-1, 0), u.ndim + 1)
+        depth = zx * u + zy * v + zz
+        return (xx * u + xy * v + xz) / depth, (yx * u + yy * v + yz) / depth, depth
+
+    def _tilted_with_jacobian(self, lens: Distorted) -> Distorted:
+        xx, xy, _, yx, yy, _, zx, zy, _ = _broadcast(self._tilt.flatten(-2).movedim(-1, 0), lens.u.ndim + 1)
+        u, v, depth = self._tilted(lens.u, lens.v)
+        a, b = (xx - u * zx) / depth, (xy - u * zy) / depth
+        c, d = (yx - v * zx) / depth, (yy - v * zy) / depth
+        return Distorted(
+            u,
+            v,
+            a * lens.du_du + b * lens.dv_du,
+            a * lens.du_dv + b * lens.dv_dv,
+            c * lens.du_du + d * lens.dv_du,
+            c * lens.du_dv + d * lens.dv_dv,
         )
 
     def undistort(self, pixels: Tensor) -> Tensor:
@@ -178,10 +286,10 @@ class Intrinsics:
         for _ in range(_UNDISTORT_ITERATIONS):
             lens = self.distort_with_jacobian(u, v)
             error_u, error_v = lens.u - u_target, lens.v - v_target
-            determinant = lens.du_du * lens.dv_dv - lens.du_dv**2
+            determinant = lens.du_du * lens.dv_dv - lens.du_dv * lens.dv_du
             determinant = torch.where(determinant.abs() < 1e-3, torch.full_like(determinant, 1e-3), determinant)
             u = u - (lens.dv_dv * error_u - lens.du_dv * error_v) / determinant
-            v = v - (lens.du_du * error_v - lens.du_dv * error_u) / determinant
+            v = v - (lens.du_du * error_v - lens.dv_du * error_u) / determinant
             if not bool((torch.maximum(error_u.abs(), error_v.abs()) > _UNDISTORT_TOLERANCE).any()):
                 break
         back_u, back_v = self.distort(u, v)
@@ -199,18 +307,39 @@ class Intrinsics:
         return fx * u + skew * v + cx, fy * v + cy
 
     @property
+    def is_tilted(self) -> bool:
+        """Whether the lens model has a tilted sensor."""
+        return self.distortion is not None and self.distortion.shape[-1] > 12
+
+    @property
+    def _has_prism(self) -> bool:
+        return self.distortion is not None and self.distortion.shape[-1] > 8
+
+    @property
     def _has_denominator(self) -> bool:
         return self.distortion is not None and self.distortion.shape[-1] > 5
 
+    @property
+    def _tilt(self) -> Tensor:
+        """Homography (..., C, 3, 3) from the plane that faces the lens to the tilted sensor."""
+        assert self.distortion is not None
+        cos_x, cos_y = self.distortion[..., 12:].cos().unbind(-1)
+        sin_x, sin_y = self.distortion[..., 12:].sin().unbind(-1)
+        zero, one = torch.zeros_like(cos_x), torch.ones_like(cos_x)
+        rotation = [cos_y, sin_y * sin_x, -sin_y * cos_x, zero, cos_x, sin_x, sin_y, -cos_y * sin_x, cos_y * cos_x]
+        depth, shift_x, shift_y = rotation[8], -rotation[2], -rotation[5]
+        onto_sensor = torch.stack([depth, zero, shift_x, zero, depth, shift_y, zero, zero, one], dim=-1)
+        return onto_sensor.unflatten(-1, (3, 3)) @ torch.stack(rotation, dim=-1).unflatten(-1, (3, 3))
+
     def _coefficients(self, ndim: int) -> list[Tensor]:
         assert self.distortion is not None
-        padding = 0 if self.fisheye else 8 - self.distortion.shape[-1]
+        padding = 0 if self.fisheye else max(0, 8 - self.distortion.shape[-1])
         padded = torch.nn.functional.pad(self.distortion, (0, padding))
         return list(_broadcast(padded.movedim(-1, 0), ndim + 1))
 
     def _rational(self, u: Tensor, v: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
         """Radial factor, its derivative by r^2, p1, p2 and r^2."""
-        k1, k2, p1, p2, k3, k4, k5, k6 = self._coefficients(u.ndim)
+        k1, k2, p1, p2, k3, k4, k5, k6 = self._coefficients(u.ndim)[:8]
         r2 = u * u + v * v
         numerator = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
         numerator_slope = k1 + r2 * (2 * k2 + 3 * r2 * k3)

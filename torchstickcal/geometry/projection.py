@@ -20,21 +20,31 @@ def to_cameras(points: Tensor, rotations: Tensor, translations: Tensor) -> Tenso
         rotations: (..., C, 3, 3), world to camera.
         translations: (..., C, 3), world to camera, metres.
     """
-    flat = points.flatten(-3, -2).unsqueeze(-3)
-    found = flat @ rotations.mT + translations.unsqueeze(-2)
-    return found.unflatten(-2, points.shape[-3:-1])
+    by_coordinate = rotations @ points.flatten(-3, -2).mT.unsqueeze(-3) + translations.unsqueeze(-1)
+    return by_coordinate.mT.unflatten(-2, points.shape[-3:-1])
 
 
 def project(points_cam: Tensor, cameras: Intrinsics) -> Tensor:
-    """Pixels (..., C, n, 2), distorted by the lenses, of points (..., C, n, 3) in the cameras' frames."""
+    """Pixels (..., C, n, 2), distorted by the lenses, of points (..., C, n, 3) in the cameras' frames, metres."""
     from kornia.geometry.calibration import distort_points
     from kornia.geometry.camera import distort_points_kannala_brandt, project_points_z1
+    from kornia.geometry.conversions import denormalize_points_with_intrinsics
 
-    normalised = project_points_z1(points_cam)
-    distortion = cameras.distortion
-    if distortion is not None and cameras.fisheye:
-        unit = distortion.new_tensor([1.0, 1.0, 0.0, 0.0]).expand(*distortion.shape[:-1], 4)
-        normalised = distort_points_kannala_brandt(normalised, torch.cat([unit, distortion], dim=-1).unsqueeze(-2))
-    elif distortion is not None:
-        normalised = distort_points(normalised, torch.eye(3).to(normalised), distortion)
-    return normalised @ cameras.matrix[..., :2, :2].mT + cameras.matrix[..., :2, 2].unsqueeze(-2)
+    normalised, matrix, distortion = project_points_z1(points_cam), cameras.matrix, cameras.distortion
+    if distortion is None:
+        pixels = denormalize_points_with_intrinsics(normalised, matrix)
+    elif cameras.fisheye:
+        pinhole = torch.cat([matrix[..., [0, 1], [0, 1]], matrix[..., :2, 2]], dim=-1)
+        pixels = distort_points_kannala_brandt(normalised, torch.cat([pinhole, distortion], dim=-1).unsqueeze(-2))
+    else:
+        pixels = distort_points(normalised, matrix, distortion, new_K=torch.eye(3).to(normalised))
+    return _with_skew(pixels, matrix)
+
+
+def _with_skew(pixels: Tensor, matrix: Tensor) -> Tensor:
+    """What kornia's camera matrices leave out: the skew shifts a pixel along x by its height above the centre."""
+    skew = matrix[..., 0, 1, None]
+    if not (skew.requires_grad or bool(skew.any())):
+        return pixels
+    x, y = pixels.unbind(-1)
+    return torch.stack([x + skew * (y - matrix[..., 1, 2, None]) / matrix[..., 1, 1, None], y], dim=-1)

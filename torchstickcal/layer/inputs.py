@@ -123,6 +123,20 @@ class LayerInputs:
             unknowns=RigUnknowns.of(refined, self.cameras, groups),
         )
 
+    def unseen(self, refined: Sequence[str], groups: Sequence[str]) -> Measurements:
+        """Measurements of the same shape in which no keypoint was seen; arguments as of :meth:`measurements`."""
+        sessions, cameras, frames, points, _ = self.keypoints.shape
+        return Measurements(
+            pixels=self.lengths_m.new_zeros(sessions, cameras, 2, frames * points),
+            confidence=self.lengths_m.new_zeros(sessions, cameras, frames * points),
+            cameras=self.cameras,
+            frames=frames,
+            sticks=torch.tensor([stick.ends for stick in self.sticks], device=self.keypoints.device),
+            lengths_m=self.lengths_m,
+            stick_sigma_m=torch.tensor([stick.sigma_m for stick in self.sticks], dtype=torch.float64),
+            unknowns=RigUnknowns.of(refined, self.cameras, groups),
+        )
+
 
 def _expanded(name: str, tensor: Tensor, shape: tuple[int, ...], like: Tensor) -> Tensor:
     """A tensor in float64, expanded to a shape.

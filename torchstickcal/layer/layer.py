@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, fields, replace
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -12,59 +11,21 @@ import torch
 from torch import Tensor, nn
 
 from torchstickcal.config import Config, load_config
-from torchstickcal.errors import CalibrationError, ConfigError, ObservationError
+from torchstickcal.errors import ConfigError, ObservationError, RigError
 from torchstickcal.geometry.cameras import Intrinsics
 from torchstickcal.layer.inputs import LayerInputs
-from torchstickcal.model.measurements import Measurements
-from torchstickcal.model.objective import Objective
+from torchstickcal.layer.result import LayerResult
 from torchstickcal.model.state import State
 from torchstickcal.model.unknowns import RigUnknowns
 from torchstickcal.observations import Stick
-from torchstickcal.pipeline.adjust import Adjustment, Run, WarmStart, adjust_cameras, adjust_points, begin
-from torchstickcal.pipeline.scale import rulers, scale_factors
-from torchstickcal.pipeline.stage import StageResult
-from torchstickcal.solvers.gradients import GradientMode, attach, gradient_mode
-from torchstickcal.solvers.newton import polish
+from torchstickcal.pipeline.adjust import Adjustment, adjust_cameras, adjust_points, begin
+from torchstickcal.pipeline.attach import attach_gradients
+from torchstickcal.pipeline.run import Run
+from torchstickcal.solvers.gradients import GradientMode, gradient_mode
 from torchstickcal.workers import map_on_workers
 
 _KEYPOINTS_AT_ONCE = 32_000
 """Keypoints of the sessions that a CPU solves side by side: more would leave its cache."""
-
-
-@dataclass(frozen=True)
-class LayerResult:
-    """Calibrated rigs, in the frame of each session's first camera; leading B only where the keypoints had it.
-
-    Poses, lenses, clocks and points carry gradients, and have the dtype and device of the keypoints.
-    """
-
-    rotations: Tensor
-    """(B, C, 3, 3), world to camera; the identity where a session could not be calibrated"""
-    translations: Tensor
-    """(B, C, 3), metres; zero where a session could not be calibrated"""
-    intrinsics: Tensor
-    """(B, C, 3, 3), camera matrices, pixels, as given or as estimated; as given where a session could not be calibrated"""
-    distortion: Tensor | None
-    """(B, C, D), likewise; None for perfect lenses"""
-    time_offsets: Tensor
-    """(B, C), time by which the middle rows of a camera's frames are exposed after those of the first camera, in frames; zero
-    where not estimated"""
-    readout: Tensor
-    """(B, C), time from the first row of an image to the last, in frames; zero where not estimated"""
-    unknowns: Tensor
-    """(B, K), what was estimated of the cameras beside their poses, as deviations from what was given"""
-    points: Tensor
-    """(B, F, P, 3), metres; zero where ``known`` is False"""
-    known: Tensor
-    """(B, F, P), True where two cameras or more see a point"""
-    inliers: Tensor
-    """(B, C, F, P), True where a keypoint was used"""
-    sigma_px: Tensor
-    """(B, P), estimated noise of each point's keypoints, pixels"""
-    converged: Tensor
-    """(B,); the gradients of a session that could not be calibrated are zero"""
-    status: tuple[str, ...]
-    """``converged``, or why not, for each session"""
 
 
 class CalibrationLayer(nn.Module):
@@ -148,12 +109,12 @@ class CalibrationLayer(nn.Module):
         keypoints = keypoints if batched else keypoints[None]
         given = LayerInputs.of(keypoints, intrinsics, stick_lengths, confidence, image_size, self.sticks, self.point_names)
         if initial is not None and not batched:
-            initial = _each(initial, lambda tensor: tensor[None])
+            initial = initial.each(lambda tensor: tensor[None])
         if initial is not None:
             self._check_initial(initial, given)
         with torch.autocast(keypoints.device.type, enabled=False):
             result = self._calibrated(given, initial)
-        return result if batched else _each(result, lambda tensor: tensor[0])
+        return result if batched else result.each(lambda tensor: tensor[0])
 
     def _calibrated(self, given: LayerInputs, initial: LayerResult | None) -> LayerResult:
         """All sessions; those that can be begun are solved side by side, a few at a time."""
@@ -162,8 +123,8 @@ class CalibrationLayer(nn.Module):
         def begun(session: int) -> Adjustment | str:
             try:
                 with torch.no_grad():
-                    return begin(given.observations(session), run, self._refined, start=_warm_start(initial, session))
-            except CalibrationError as error:
+                    return begin(given.observations(session), run, self._refined, start=initial and initial.warm_start(session))
+            except (ObservationError, RigError) as error:
                 return f"{type(error).__name__}: {error}"
 
         starts = dict(enumerate(map_on_workers(device, begun, range(len(given.keypoints)))))
@@ -178,81 +139,25 @@ class CalibrationLayer(nn.Module):
 
         results = map_on_workers(device, solved, chosen)
         results += [self._failed(given.of_sessions([session]), status) for session, status in failed.items()]
-        return _in_order(results, [*itertools.chain(*chosen), *failed])
+        return LayerResult.together(results, [*itertools.chain(*chosen), *failed])
 
     def _solved(self, given: LayerInputs, begun: Adjustment, run: Run, only_last: bool) -> LayerResult:
         """Sessions adjusted side by side, their last stages with gradients by what was given."""
         with torch.no_grad():
             ended = adjust_points(adjust_cameras(begun, run, only_last), run)
         data = given.measurements(ended.seen, ended.measurements, self._refined, self.config.camera_groups)
-        state = self._with_gradients(data, ended)
+        state = attach_gradients(ended, data, run, self.gradient)
         status = tuple(ended.status(session) for session in range(data.sessions))
-        known = data.by_frame(ended.last.inliers.any(1))
-        points = data.by_frame(state.points).movedim(1, -1).where(known[..., None], 0.0)
-        inliers, cameras = data.by_frame(ended.last.inliers), data.cameras_at(state)
-        return self._result(given, cameras, data.unknowns, state, points, known, inliers, ended.last.sigma_px, status)
-
-    def _with_gradients(self, data: Measurements, ended: Adjustment) -> State:
-        """The state where the last stage ended, with gradients by the measurements.
-
-        It depends on them through the last stage that estimated cameras and through those after it.
-        """
-        known = [
-            replace(ruler, lengths_m=data.lengths_m[:, number]) if ruler.rigid else ruler
-            for number, ruler in enumerate(rulers(ended.observations, self.config))
-        ]
-        state = ended.state
-        for number, result in enumerate(ended.results):
-            kept = replace(data, confidence=data.confidence.where(result.inliers, 0.0))
-            fixed = None if result.stage.cameras == "free" else state if number else result.minimum
-            state = attach(Objective(kept, result.losses), _polished(kept, result, fixed), self.gradient, fixed)
-            if result.stage.rescale:
-                state = state.scaled(scale_factors(kept, state.points, known))
-        return state
+        return LayerResult.of(data, state, ended.last.inliers, ended.last.sigma_px, status, given.keypoints.dtype)
 
     @torch.no_grad()
     def _failed(self, given: LayerInputs, status: str) -> LayerResult:
-        """One session that could not be calibrated, and why."""
-        like, unknowns = given.keypoints, RigUnknowns.of(self._refined, given.cameras, self.config.camera_groups)
-        _, cameras, frames, points, _ = like.shape
-        nothing = torch.zeros(1, cameras, frames, points, dtype=torch.bool, device=like.device)
-        zero = given.lengths_m.new_zeros(1, frames, points, 3)
-        rotations = torch.eye(3).to(zero).expand(1, cameras, 3, 3)
-        state = State(rotations, zero.new_zeros(1, cameras, 3), zero.flatten(1, 2).mT, unknowns.given)
-        lenses, sigma_px = unknowns.applied(given.cameras, unknowns.given), zero.new_zeros(1, points)
-        return self._result(given, lenses, unknowns, state, zero, nothing[:, 0], nothing, sigma_px, (status,))
-
-    @staticmethod
-    def _result(
-        given: LayerInputs,
-        cameras: Intrinsics,
-        unknowns: RigUnknowns,
-        state: State,
-        points: Tensor,
-        known: Tensor,
-        inliers: Tensor,
-        sigma_px: Tensor,
-        status: tuple[str, ...],
-    ) -> LayerResult:
-        """A result in the dtype of the keypoints."""
-        dtype, by_name = given.keypoints.dtype, unknowns.by_name(state.unknowns)
-        zero = torch.zeros_like(given.cameras.focal_px)[..., None]
-        lenses = cameras.to(dtype)
-        return LayerResult(
-            rotations=state.rotations.to(dtype),
-            translations=state.translations.to(dtype),
-            intrinsics=lenses.matrix,
-            distortion=lenses.distortion,
-            time_offsets=by_name.get("time_offset", zero)[..., 0].to(dtype),
-            readout=by_name.get("readout", zero)[..., 0].to(dtype),
-            unknowns=state.unknowns.to(dtype),
-            points=points.to(dtype),
-            known=known,
-            inliers=inliers,
-            sigma_px=sigma_px.to(dtype),
-            converged=torch.tensor([said == "converged" for said in status], device=points.device),
-            status=status,
-        )
+        """One session that could not be calibrated, and why: poses of nothing, cameras as given."""
+        data = given.unseen(self._refined, self.config.camera_groups)
+        poses = torch.eye(3).to(data.pixels).expand(1, data.num_cameras, 3, 3), data.pixels.new_zeros(1, data.num_cameras, 3)
+        state = State(*poses, data.pixels.new_zeros(1, 3, data.num_columns), data.unknowns.given)
+        sigma_px = data.pixels.new_zeros(1, data.points_per_frame)
+        return LayerResult.of(data, state, data.visible, sigma_px, (status,), given.keypoints.dtype)
 
     def _check_initial(self, initial: LayerResult, given: LayerInputs) -> None:
         """Refuse a start from another batch, or with other unknowns.
@@ -270,48 +175,6 @@ class CalibrationLayer(nn.Module):
                 got=f"{got[0]} sessions, {got[1]} cameras, {got[2]} unknowns",
                 expected=f"{expected[0]} sessions, {expected[1]} cameras, {expected[2]} unknowns",
             )
-
-
-def _warm_start(initial: LayerResult | None, session: int) -> WarmStart | None:
-    """Where a session starts from; None for a start from nothing, as after a failure."""
-    if initial is None or not bool(initial.converged[session]):
-        return None
-    points = initial.points[session].detach()
-    return WarmStart(
-        initial.rotations[session].detach(),
-        initial.translations[session].detach(),
-        points.where(initial.known[session][..., None], torch.nan),
-        initial.unknowns[session].detach(),
-        initial.inliers[session],
-        initial.sigma_px[session].detach(),
-    )
-
-
-@torch.no_grad()
-def _polished(measurements: Measurements, result: StageResult, fixed: State | None) -> State:
-    """A stage's minimum, to rounding: a gradient is as exact as the minimum at which it is taken."""
-    start = result.minimum if fixed is None else replace(fixed, points=result.minimum.points)
-    return polish(Objective(measurements, result.losses), start, cameras_free=fixed is None)
-
-
-def _in_order(results: Sequence[LayerResult], sessions: Sequence[int]) -> LayerResult:
-    """Results of some sessions each as one result of all, in the order of the sessions' numbers."""
-    order = sorted(range(len(sessions)), key=lambda place: sessions[place])
-    status = [said for result in results for said in result.status]
-
-    def together(name: str) -> Tensor | None:
-        tensors = [getattr(result, name) for result in results]
-        return None if tensors[0] is None else torch.cat(tensors)[order]
-
-    names = [field.name for field in fields(LayerResult) if field.name != "status"]
-    tensors: dict[str, Any] = {name: together(name) for name in names}
-    return LayerResult(**tensors, status=tuple(status[place] for place in order))
-
-
-def _each(result: LayerResult, function: Callable[[Tensor], Tensor]) -> LayerResult:
-    """A result made of another, tensor by tensor."""
-    tensors = {field.name: getattr(result, field.name) for field in fields(result) if field.name != "status"}
-    return replace(result, **{name: tensor if tensor is None else function(tensor) for name, tensor in tensors.items()})
 
 
 def _refined(config: Config) -> tuple[str, ...]:

@@ -17,7 +17,7 @@ from torch import Tensor
 from torchstickcal.geometry.cameras import Intrinsics
 from torchstickcal.model.state import State
 from torchstickcal.model.unknowns import Columns, ImageMotion, RigUnknowns
-from torchstickcal.observations import Observations
+from torchstickcal.observations import Observations, point_index
 
 _CHUNK_KEYPOINTS = {"cpu": 32_000, "cuda": 1_000_000}
 """Keypoints worked on at a time. What a CPU works on stays in its cache; elsewhere an operation should be worth its launch."""
@@ -37,6 +37,7 @@ class Measurements:
         stick_sigma_m: (S,), the tolerances of these lengths, metres.
         unknowns: what is unknown of the cameras beside their poses.
         motion: of the keypoints, where clocks are among the unknowns.
+        point_names: P names; None where the points have none.
     """
 
     pixels: Tensor
@@ -48,6 +49,7 @@ class Measurements:
     stick_sigma_m: Tensor
     unknowns: RigUnknowns
     motion: ImageMotion | None = None
+    point_names: tuple[str, ...] | None = None
 
     @staticmethod
     def of(observations: Observations, use: Collection[int] | None = None, dtype: torch.dtype = torch.float64) -> Measurements:
@@ -78,6 +80,7 @@ class Measurements:
             lengths_m=torch.tensor([[s.length_m for s in sticks]], dtype=torch.float64).to(device),
             stick_sigma_m=torch.tensor([s.sigma_m for s in sticks], dtype=torch.float64).to(device),
             unknowns=RigUnknowns.of((), cameras),
+            point_names=observations.point_names,
         )
 
     @staticmethod
@@ -107,6 +110,7 @@ class Measurements:
             first.stick_sigma_m,
             RigUnknowns.stack([session.unknowns for session in sessions]),
             ImageMotion(*map(torch.cat, zip(*motions, strict=True))) if motions else None,
+            first.point_names,
         )
 
     def __getitem__(self, sessions: slice) -> Measurements:
@@ -210,6 +214,14 @@ class Measurements:
     def points_per_frame(self) -> int:
         """P"""
         return self.num_columns // self.frames
+
+    def point_index(self, name: str) -> int:
+        """The index of a named point.
+
+        Raises:
+            ObservationError: if no point has the name.
+        """
+        return point_index(name, self.point_names)
 
     def chunks(self) -> list[slice]:
         """Slices of the columns, whole frames each, small enough to be worked on at a time."""

@@ -20,6 +20,7 @@ from torchstickcal.model.unknowns import RigUnknowns, clock_refinements, with_re
 from torchstickcal.observations import Observations
 from torchstickcal.pipeline.focal_search import search_focal
 from torchstickcal.pipeline.initialise import initialise, triangulated
+from torchstickcal.pipeline.run import Run
 from torchstickcal.pipeline.scale import rulers
 from torchstickcal.pipeline.stage import StageResult, run_stage
 from torchstickcal.pipeline.synchronise import (
@@ -30,48 +31,9 @@ from torchstickcal.pipeline.synchronise import (
     on_common_frames,
     synchronise_keypoints,
 )
-from torchstickcal.solvers import Listener, StageRecord, unheard
+from torchstickcal.solvers import StageRecord
 
 _INITIALISE = "initialise"
-
-
-@dataclass(frozen=True)
-class Run:
-    """What all steps of a calibration share.
-
-    Args:
-        config: the configuration.
-        listener: hears every iteration.
-        seconds: time by step, which the steps add to.
-    """
-
-    config: Config
-    listener: Listener = unheard
-    seconds: dict[str, float] = field(default_factory=dict)
-
-    @property
-    def camera_stages(self) -> dict[str, Stage]:
-        """The stages up to the last that estimates cameras."""
-        return dict(self._stages[: self._fixed])
-
-    @property
-    def point_stages(self) -> dict[str, Stage]:
-        """The stages after it, in which the cameras are fixed."""
-        return dict(self._stages[self._fixed :])
-
-    def took(self, step: str, seconds: float) -> None:
-        """Add to the time of a step."""
-        self.seconds[step] = self.seconds.get(step, 0.0) + seconds
-
-    @property
-    def _stages(self) -> list[tuple[str, Stage]]:
-        return list(self.config.stages.items())
-
-    @property
-    def _fixed(self) -> int:
-        """Number of stages up to the last that estimates cameras; all where none does."""
-        free = [number for number, (_, stage) in enumerate(self._stages) if stage.cameras == "free"]
-        return max(free, default=len(self._stages) - 1) + 1
 
 
 @dataclass(frozen=True)
@@ -218,19 +180,20 @@ def begin(
         start: an earlier estimate; None to estimate the rig from nothing.
 
     Raises:
-        ConfigError: if there are camera groups, but not a label for each camera.
+        ConfigError: if nothing sets the scale, and if there are camera groups, but not a label for each camera.
         ObservationError: if no two cameras have a frame in common.
         RigError: if the cameras cannot be placed in one rig.
     """
     began = time.perf_counter()
     config, frames = run.config, on_common_frames(observations, offsets_frames)
     seen = measured(frames, config)
+    rulers(seen, config)
     if start is not None:
         state = _state_of(start, seen, config)
     elif observations.intrinsics_known:
         state = initialise(seen, config.initialise, observations.camera_labels)
     else:
-        seen, state = search_focal(seen, observations, config)
+        seen, state = search_focal(seen, observations.camera_labels, run)
         refined = refined if "focal" in refined else with_refinements(refined, ("focal_shared",))
     seen = replace(seen, unknowns=RigUnknowns.of(refined, seen.cameras, config.camera_groups))
     if start is None:
@@ -306,7 +269,7 @@ def points_used(observations: Observations, config: Config) -> list[int] | None:
 
 def _through(stages: Iterable[tuple[str, Stage]], adjustment: Adjustment, run: Run) -> Adjustment:
     for name, stage in stages:
-        adjustment = adjustment.ended(_run_stage(name, stage, adjustment, run))
+        adjustment = adjustment.ended(run_stage(name, stage, adjustment.measurements, adjustment.state, run))
     return adjustment
 
 
@@ -316,21 +279,13 @@ def _synchronised(adjustment: Adjustment, run: Run) -> Adjustment:
         return adjustment
     *_, stage = run.camera_stages.values()
 
-    def again(measurements: Measurements, state: State) -> StageResult:
-        return _run_stage(CLOCK_STAGE, stage, replace(adjustment, measurements=measurements, state=state), run)
+    def run_again(measurements: Measurements, state: State) -> StageResult:
+        return run_stage(CLOCK_STAGE, stage, measurements, state, run)
 
     before = adjustment.measurements, adjustment.last
-    measurements, result, records = synchronise_keypoints(adjustment.seen, adjustment.exposures, *before, again)
+    measurements, result, records = synchronise_keypoints(adjustment.seen, adjustment.exposures, *before, run_again)
     together = tuple((*earlier, *own) for earlier, own in zip(adjustment.records, records, strict=True))
     return replace(adjustment, measurements=measurements, state=result.state, results=(result,), records=together)
-
-
-def _run_stage(name: str, stage: Stage, adjustment: Adjustment, run: Run) -> StageResult:
-    known = rulers(adjustment.observations, run.config)
-    measurements, state, observations = adjustment.measurements, adjustment.state, adjustment.observations[0]
-    result = run_stage(name, stage, measurements, state, observations, known, run.config.solver, run.listener)
-    run.took(name, result.records[0].seconds)
-    return result
 
 
 def _state_of(start: WarmStart, seen: Measurements, config: Config) -> State:

@@ -2,28 +2,26 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import torch
 from torch import Tensor
 
-from torchstickcal.config import Config
 from torchstickcal.errors import RigError
 from torchstickcal.geometry.cameras import Intrinsics
 from torchstickcal.model.measurements import Measurements
 from torchstickcal.model.state import State
 from torchstickcal.model.unknowns import RigUnknowns
-from torchstickcal.observations import Observations
 from torchstickcal.pipeline.initialise import initialise
-from torchstickcal.pipeline.scale import rulers
+from torchstickcal.pipeline.run import Run
 from torchstickcal.pipeline.stage import run_stage
-from torchstickcal.solvers import unheard
 
 _RATIOS = (0.45, 0.55, 0.67, 0.82, 1.0, 1.22, 1.5, 1.83, 2.2)
 """Focal lengths tried, over the guessed ones."""
 
 
-def search_focal(measurements: Measurements, observations: Observations, config: Config) -> tuple[Measurements, State]:
+def search_focal(measurements: Measurements, labels: Sequence[str], run: Run) -> tuple[Measurements, State]:
     """Cameras near their focal lengths, and a first estimate of rig and points.
 
     From each of the ratios the first stage adjusts rig, points and a focal length common to each camera group; the median
@@ -31,12 +29,13 @@ def search_focal(measurements: Measurements, observations: Observations, config:
 
     Args:
         measurements: one session, with guessed cameras.
-        observations: the same as the user gave it.
-        config: the configuration.
+        labels: the cameras' names, for messages.
+        run: what all steps share; nobody listens to the trials.
 
     Raises:
         RigError: if no focal length lets the cameras be placed in one rig.
     """
+    config, quiet = run.config, Run(run.config)
     name, stage = next(iter(config.stages.items()))
     best = torch.inf
     found: tuple[Measurements, State] | None = None
@@ -45,13 +44,12 @@ def search_focal(measurements: Measurements, observations: Observations, config:
         trial = replace(measurements, cameras=_scaled(measurements.cameras, ratio))
         trial = replace(trial, unknowns=RigUnknowns.of(("focal_shared",), trial.cameras, config.camera_groups))
         try:
-            start = initialise(trial, config.initialise, observations.camera_labels)
+            start = initialise(trial, config.initialise, labels)
         except RigError as error:
             failure = error
             continue
         start = replace(start, unknowns=trial.unknowns.given)
-        known = rulers([observations], config)
-        state = run_stage(name, stage, trial, start, observations, known, config.solver, unheard).state
+        state = run_stage(name, stage, trial, start, quiet).state
         residual = _median_residual(trial, state)
         if residual < best:
             best = residual

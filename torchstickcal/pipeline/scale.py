@@ -11,7 +11,6 @@ from torch import Tensor
 from torchstickcal.config import Config
 from torchstickcal.errors import ConfigError, ObservationError
 from torchstickcal.model.measurements import Measurements
-from torchstickcal.observations import Observations
 
 _OUTLIER_CUT = 3.5
 _MAD_TO_SIGMA = 1.4826
@@ -39,31 +38,23 @@ class Ruler:
         return vectors.square().sum(1).where(known, 1.0).sqrt().where(known, torch.nan)
 
 
-def rulers(sessions: Sequence[Observations], config: Config) -> list[Ruler]:
-    """What the scale comes from: the configuration's ``scale``, else the sticks, of sessions with the same points and sticks.
+def rulers(measurements: Measurements, config: Config) -> list[Ruler]:
+    """What the scale comes from: the configuration's ``scale``, else the sticks among the points that take part.
 
     Raises:
         ConfigError: if there is neither.
         ObservationError: if ``scale`` names a point that the session does not have.
     """
-    observations = sessions[0]
-
-    def lengths(values: list[float]) -> Tensor:
-        return torch.tensor(values, dtype=torch.float64, device=observations.keypoints.device)
-
     if config.scale is not None:
-        start, end = (tuple(map(observations.point_index, names)) for names in (config.scale.start, config.scale.end))
-        return [Ruler(start, end, lengths([config.scale.length_m] * len(sessions)), rigid=False)]
-    if observations.sticks and config.points != "joints":
-        found: list[Ruler] = []
-        for number, stick in enumerate(observations.sticks):
-            start, end = stick.ends
-            found.append(Ruler((start,), (end,), lengths([s.sticks[number].length_m for s in sessions]), rigid=True))
+        start, end = (tuple(map(measurements.point_index, names)) for names in (config.scale.start, config.scale.end))
+        return [Ruler(start, end, torch.full_like(measurements.cameras.focal_px[:, 0], config.scale.length_m), rigid=False)]
+    sticks = zip(measurements.sticks.tolist(), measurements.lengths_m.unbind(1), strict=True)
+    if found := [Ruler((start,), (end,), length_m, rigid=True) for (start, end), length_m in sticks]:
         return found
     raise ConfigError(
         "nothing sets the scale",
         where="scale",
-        got=f"{len(observations.sticks)} sticks, points = {config.points!r}",
+        got=f"no stick, points = {config.points!r}",
         expected="a stick among the points that take part, or a [scale] table with a known length",
     )
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
 from typing import NamedTuple
 
 import torch
@@ -15,9 +14,9 @@ from torchstickcal.model.measurements import Measurements
 from torchstickcal.model.noise import estimate_acceleration_m, estimate_sigma_px
 from torchstickcal.model.objective import Objective
 from torchstickcal.model.state import State
-from torchstickcal.observations import Observations
-from torchstickcal.pipeline.scale import Ruler, scale_factors
-from torchstickcal.solvers import Listener, StageRecord, Termination, solver
+from torchstickcal.pipeline.run import Run
+from torchstickcal.pipeline.scale import rulers, scale_factors
+from torchstickcal.solvers import StageRecord, Termination, solver
 from torchstickcal.solvers.elimination.normal_equations import NormalEquations
 
 _RESOLUTION = {torch.float64: 0.0, torch.float32: 1e-6}
@@ -57,10 +56,7 @@ def run_stage(
     stage: Stage,
     measurements: Measurements,
     state: State,
-    observations: Observations,
-    known: Sequence[Ruler],
-    solver_name: str,
-    listener: Listener,
+    run: Run,
 ) -> StageResult:
     """Run one stage from a state, for all sessions.
 
@@ -69,10 +65,7 @@ def run_stage(
         stage: its settings.
         measurements: the sessions.
         state: where it starts.
-        observations: one of the sessions, for the names of its points.
-        known: the lengths that set the scale.
-        solver_name: which solver.
-        listener: hears every iteration.
+        run: what all steps share.
     """
     began = time.perf_counter()
     squared_residuals = measurements.squared_residuals(state)
@@ -82,27 +75,26 @@ def run_stage(
         agreeing = measurements.by_frame(squared_residuals) <= limits[:, None, None]
         measurements = measurements.keeping(agreeing.flatten(2))
     del squared_residuals
-    objective = Objective(measurements, _losses(stage, measurements, state, observations, sigma_px))
-    outcome = solver(solver_name)(
+    objective = Objective(measurements, _losses(stage, measurements, state, sigma_px))
+    outcome = solver(run.config.solver)(
         objective,
         state,
         cameras_free=stage.cameras == "free",
         termination=Termination(stage.max_iterations, max(stage.cost_tolerance, _RESOLUTION[measurements.pixels.dtype])),
         stage=name,
-        listener=listener,
+        listener=run.listener,
     )
     state = minimum = outcome.state
     if stage.rescale:
-        state = minimum.scaled(scale_factors(measurements, minimum.points, known))
+        state = minimum.scaled(scale_factors(measurements, minimum.points, rulers(measurements, run.config)))
     seconds = time.perf_counter() - began
+    run.took(name, seconds)
     ended = zip(outcome.stops, outcome.iterations, strict=True)
     records = tuple(StageRecord(name, stop, seconds, iterations) for stop, iterations in ended)
     return StageResult(stage, state, minimum, objective.losses, measurements.visible, sigma_px, records)
 
 
-def _losses(
-    stage: Stage, measurements: Measurements, state: State, observations: Observations, sigma_px: Tensor
-) -> dict[str, Loss]:
+def _losses(stage: Stage, measurements: Measurements, state: State, sigma_px: Tensor) -> dict[str, Loss]:
     """The losses of a stage. Track losses come last: their sigma may be estimated with the others at hand."""
     losses: dict[str, Loss] = {}
 
@@ -113,7 +105,7 @@ def _losses(
     def is_track(named: tuple[str, LossSettings]) -> bool:
         return issubclass(named[1].loss, TrackLoss)
 
-    context = LossContext(observations.point_index, measurements.stick_sigma_m, sigma_px, acceleration_m)
+    context = LossContext(measurements.point_index, measurements.stick_sigma_m, sigma_px, acceleration_m)
     for name, settings in sorted(stage.losses.items(), key=is_track):
         losses[name] = settings.build(context)
     return losses

@@ -33,6 +33,8 @@ class Radial(LensUnknown):
         return replace(cameras, distortion=given + torch.nn.functional.pad(deviations, (0, given.shape[-1] - 2)))
 
     def columns(self, view: View) -> tuple[Tensor, Tensor]:
+        if view.cameras.is_tilted:
+            return super().columns(view)
         first, second = (view.cameras.pixels_by_radial(view.u, view.v, order) for order in (1, 2))
         x, y = (torch.stack(axis, dim=-2) for axis in zip(first, second, strict=True))
         return x, y

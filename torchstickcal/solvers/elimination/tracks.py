@@ -73,9 +73,10 @@ class BlockTridiagonal:
 
 
 def _inverse_factor(blocks: Tensor) -> Tensor:
-    """Inverses of the Cholesky factors of blocks (..., m, m)."""
+    """Inverses of the Cholesky factors of blocks (..., m, m); NaN for blocks that are not positive definite."""
     identity = torch.eye(blocks.shape[-1], dtype=blocks.dtype, device=blocks.device).expand_as(blocks)
-    return torch.linalg.solve_triangular(torch.linalg.cholesky(blocks), identity, upper=False)
+    factor, failed = torch.linalg.cholesky_ex(blocks)
+    return torch.linalg.solve_triangular(factor, identity, upper=False).where(failed[..., None, None] == 0, torch.nan)
 
 
 class TrackElimination:

@@ -1,0 +1,125 @@
+"""What a layer gives back."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, fields, replace
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from torchstickcal.model.measurements import Measurements
+from torchstickcal.model.state import State
+from torchstickcal.pipeline.adjust import WarmStart
+
+
+@dataclass(frozen=True)
+class LayerResult:
+    """Calibrated rigs, in the frame of each session's first camera; leading B only where the keypoints had it.
+
+    Poses, lenses, clocks and points carry gradients, and have the dtype and device of the keypoints.
+
+    Example:
+        >>> from torchstickcal import CalibrationLayer
+        >>> from torchstickcal.simulate import golf_session
+        >>> observations, truth = golf_session(cameras=3, frames=10)
+        >>> result = CalibrationLayer(observations.sticks)(observations.keypoints, observations.cameras)
+        >>> result.status, result.points.shape
+        (('converged',), torch.Size([10, 21, 3]))
+    """
+
+    rotations: Tensor
+    """(B, C, 3, 3), world to camera; the identity where a session could not be calibrated"""
+    translations: Tensor
+    """(B, C, 3), metres; zero where a session could not be calibrated"""
+    intrinsics: Tensor
+    """(B, C, 3, 3), camera matrices, pixels, as given or as estimated; as given where a session could not be calibrated"""
+    distortion: Tensor | None
+    """(B, C, D), likewise; None for perfect lenses"""
+    time_offsets: Tensor
+    """(B, C), time by which the middle rows of a camera's frames are exposed after those of the first camera, in frames; zero
+    where not estimated"""
+    readout: Tensor
+    """(B, C), time from the first row of an image to the last, in frames; zero where not estimated"""
+    unknowns: Tensor
+    """(B, K), what was estimated of the cameras beside their poses, as deviations from what was given"""
+    points: Tensor
+    """(B, F, P, 3), metres; zero where ``known`` is False"""
+    known: Tensor
+    """(B, F, P), True where two cameras or more see a point"""
+    inliers: Tensor
+    """(B, C, F, P), True where a keypoint was used"""
+    sigma_px: Tensor
+    """(B, P), estimated noise of each point's keypoints, pixels"""
+    converged: Tensor
+    """(B,); the gradients of a session that could not be calibrated are zero"""
+    status: tuple[str, ...]
+    """``converged``, or why not, for each session"""
+
+    @staticmethod
+    def of(
+        data: Measurements, state: State, inliers: Tensor, sigma_px: Tensor, status: Sequence[str], dtype: torch.dtype
+    ) -> LayerResult:
+        """A result in a dtype.
+
+        Args:
+            data: what was measured.
+            state: the estimate.
+            inliers: (B, C, N), the keypoints that were used.
+            sigma_px: (B, P).
+            status: of each session.
+            dtype: of what floats.
+        """
+        known, cameras = data.by_frame(inliers.any(1)), data.cameras_at(state).to(dtype)
+        found, zero = data.unknowns.by_name(state.unknowns), torch.zeros_like(data.cameras.focal_px)[..., None]
+        return LayerResult(
+            rotations=state.rotations.to(dtype),
+            translations=state.translations.to(dtype),
+            intrinsics=cameras.matrix,
+            distortion=cameras.distortion,
+            time_offsets=found.get("time_offset", zero)[..., 0].to(dtype),
+            readout=found.get("readout", zero)[..., 0].to(dtype),
+            unknowns=state.unknowns.to(dtype),
+            points=data.by_frame(state.points).movedim(1, -1).where(known[..., None], 0.0).to(dtype),
+            known=known,
+            inliers=data.by_frame(inliers),
+            sigma_px=sigma_px.to(dtype),
+            converged=torch.tensor([said == "converged" for said in status], device=known.device),
+            status=tuple(status),
+        )
+
+    def each(self, function: Callable[[Tensor], Tensor]) -> LayerResult:
+        """A result made of this one, tensor by tensor."""
+        tensors = {name: getattr(self, name) for name in _TENSORS}
+        return replace(self, **{name: tensor if tensor is None else function(tensor) for name, tensor in tensors.items()})
+
+    def warm_start(self, session: int) -> WarmStart | None:
+        """Where a session may start from another time; None after a failure."""
+        if not bool(self.converged[session]):
+            return None
+        points = self.points[session].detach()
+        return WarmStart(
+            self.rotations[session].detach(),
+            self.translations[session].detach(),
+            points.where(self.known[session][..., None], torch.nan),
+            self.unknowns[session].detach(),
+            self.inliers[session],
+            self.sigma_px[session].detach(),
+        )
+
+    @staticmethod
+    def together(results: Sequence[LayerResult], sessions: Sequence[int]) -> LayerResult:
+        """Results of some sessions each as one result of all, in the order of the sessions' numbers."""
+        order = sorted(range(len(sessions)), key=lambda place: sessions[place])
+        status = [said for result in results for said in result.status]
+
+        def joined(name: str) -> Tensor | None:
+            tensors = [getattr(result, name) for result in results]
+            return None if tensors[0] is None else torch.cat(tensors)[order]
+
+        tensors: dict[str, Any] = {name: joined(name) for name in _TENSORS}
+        return LayerResult(**tensors, status=tuple(status[place] for place in order))
+
+
+_TENSORS = [field.name for field in fields(LayerResult) if field.name != "status"]

@@ -1,0 +1,47 @@
+"""What all steps of one calibration share: its configuration, who listens, and how long each step took."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+from torchstickcal.config import Config, Stage
+from torchstickcal.solvers import Listener, unheard
+
+
+@dataclass(frozen=True)
+class Run:
+    """One calibration of one session, or of several side by side.
+
+    Args:
+        config: the configuration.
+        listener: hears every iteration.
+        seconds: time by step, which the steps add to.
+    """
+
+    config: Config
+    listener: Listener = unheard
+    seconds: dict[str, float] = field(default_factory=dict)
+
+    @property
+    def camera_stages(self) -> dict[str, Stage]:
+        """The stages up to the last that estimates cameras."""
+        return dict(self._stages[: self._number_of_camera_stages])
+
+    @property
+    def point_stages(self) -> dict[str, Stage]:
+        """The stages after it, in which the cameras are fixed."""
+        return dict(self._stages[self._number_of_camera_stages :])
+
+    def took(self, step: str, seconds: float) -> None:
+        """Add to the time of a step."""
+        self.seconds[step] = self.seconds.get(step, 0.0) + seconds
+
+    @property
+    def _stages(self) -> list[tuple[str, Stage]]:
+        return list(self.config.stages.items())
+
+    @property
+    def _number_of_camera_stages(self) -> int:
+        """All stages where none estimates cameras."""
+        free = [number for number, (_, stage) in enumerate(self._stages) if stage.cameras == "free"]
+        return max(free, default=len(self._stages) - 1) + 1

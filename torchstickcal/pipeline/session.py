@@ -1,0 +1,158 @@
+"""One session, adjusted in different ways: at other time offsets, and with more unknown of its cameras."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import cached_property
+
+from torch import Tensor
+
+from torchstickcal.errors import ObservationError, RigError
+from torchstickcal.model.measurements import Measurements
+from torchstickcal.model.unknowns import REFINEMENTS, clock_refinements, with_refinements
+from torchstickcal.observations import Observations
+from torchstickcal.pipeline.adjust import Adjustment, adjust_again, adjust_cameras, begin, measured
+from torchstickcal.pipeline.check import CameraCheck
+from torchstickcal.pipeline.run import Run
+from torchstickcal.pipeline.synchronise import ClockEstimate, on_common_frames, search_offsets, unsynchronised
+
+_MAX_STARTS = 3
+_FAR_FRAMES = 0.75
+"""Time offset from the frames chosen, in frames, from which on other frames are nearer."""
+_FITTING_SHARE, _FITTING_FOCAL_SHARE = 0.6, 0.01
+"""Least fraction of inliers, and largest noise as a fraction of the focal length, of cameras that fit together."""
+
+
+class Session:
+    """A session on its way to a calibration.
+
+    Args:
+        observations: the session.
+        run: what all steps share.
+
+    Raises:
+        ObservationError: if the configuration names something to refine that the session does not allow.
+    """
+
+    def __init__(self, observations: Observations, run: Run) -> None:
+        self._observations, self._run = observations, run
+        config = run.config
+        self.named = () if config.refine == "auto" else tuple(config.refine)
+        """what the configuration refines"""
+        self.allowed = set(self.named)
+        """what may be refined"""
+        if config.refine == "auto":
+            self.allowed = self._refinable if config.synchronise else self._refinable - clock_refinements()
+        if impossible := set(self.named) - self._refinable:
+            raise ObservationError(
+                "clocks cannot be estimated without a frame rate",
+                where="refine",
+                got=", ".join(sorted(impossible)),
+                expected="fps or timestamps, and for readout also image_size",
+            )
+
+    @cached_property
+    def unsynchronised(self) -> bool:
+        """Whether the cameras' frames clearly do not belong together as given, by the motion in the images."""
+        return "time_offset" in self._refinable and unsynchronised(*self._keypoints_and_reach)
+
+    def searched(self) -> ClockEstimate:
+        """The time offsets, by the motion in the images."""
+        return search_offsets(*self._keypoints_and_reach)
+
+    def adjusted(self, clocks: ClockEstimate | None) -> tuple[Adjustment, ClockEstimate | None]:
+        """Adjusted at the time offsets at which the views fit together best, of those given and those searched for.
+
+        Args:
+            clocks: time offsets that were searched for. If there are none, and the cameras do not fit together at those given,
+                they are searched for now.
+
+        Returns:
+            The adjustment with all that the configuration refines, and the time offsets that were searched for.
+
+        Raises:
+            RigError: if the cameras cannot be placed in one rig.
+        """
+        found = [] if clocks is None else self._at_offsets(clocks)
+        failure: RigError | None = None
+        if not any(map(_fits, found)):
+            try:
+                found.append(self._adjusted_at([name for name in self.named if name not in clock_refinements()]))
+            except RigError as error:
+                failure = error
+        if clocks is None and "time_offset" in self.allowed and not any(map(_fits, found)):
+            clocks = self.searched()
+            found += self._at_offsets(clocks)
+        if not found and failure is not None:
+            raise failure
+        best = min(found, key=_median_squared_residual)
+        return best if set(self.named) <= set(best.refined) else self._with(best, self.named), clocks
+
+    def refined_where_contradicted(self, adjusted: Adjustment, check: CameraCheck) -> tuple[Adjustment, CameraCheck]:
+        """Adjusted with what the keypoints contradict of the cameras, the most contradicted first, and checked again."""
+        failed: list[tuple[str, ...]] = []
+        while choice := check.wanted(self.allowed, adjusted.refined, failed):
+            refined = self._with(adjusted, with_refinements(adjusted.refined, choice))
+            if refined.converged:
+                adjusted, check = refined, CameraCheck(refined, self._run.config.camera_groups)
+            else:
+                failed.append(choice)
+        return adjusted, check
+
+    def _at_offsets(self, clocks: ClockEstimate) -> list[Adjustment]:
+        """Adjusted at the likeliest offsets, and where not all are certain, also at the certain ones alone."""
+        found: list[Adjustment] = []
+        for offsets in (clocks.likeliest_frames, *(() if all(clocks.determined) else (clocks.offsets_frames,))):
+            try:
+                found.append(self._adjusted_at(with_refinements(self.named, ("time_offset",)), offsets))
+            except (RigError, ObservationError):
+                continue
+        return found
+
+    def _adjusted_at(self, refined: Sequence[str], offsets_frames: Tensor | None = None) -> Adjustment:
+        """Initialised and adjusted at some time offsets (C,) of the cameras, in frames; None for those given."""
+        begun = begin(self._observations, self._run, refined, offsets_frames)
+        return self._at_nearest_frames(adjust_cameras(begun, self._run))
+
+    def _with(self, adjustment: Adjustment, refined: Sequence[str]) -> Adjustment:
+        """Adjusted from where an adjustment has ended, with more refined."""
+        return self._at_nearest_frames(adjust_again(adjustment, self._run, refined))
+
+    def _at_nearest_frames(self, adjustment: Adjustment) -> Adjustment:
+        """Adjusted from the beginning where the time offsets found say that other frames are nearer to the common frames."""
+        for _ in range(_MAX_STARTS - 1):
+            remaining = adjustment.remaining_offsets_frames
+            if not bool((remaining.abs() > _FAR_FRAMES).any()):
+                break
+            offsets = adjustment.frames[0].offsets_frames + remaining
+            adjustment = adjust_cameras(begin(self._observations, self._run, adjustment.refined, offsets), self._run)
+        return adjustment
+
+    @property
+    def _keypoints_and_reach(self) -> tuple[Measurements, float]:
+        """The keypoints at the times given, and the largest time offset that is looked for, in frames."""
+        frames = on_common_frames(self._observations)
+        assert frames.rate_hz is not None
+        return measured(frames, self._run.config), self._run.config.max_offset_s * frames.rate_hz
+
+    @property
+    def _refinable(self) -> set[str]:
+        """What the session allows: clocks are counted in frames per second, read-out times in rows of the image."""
+        given = self._observations
+        names = set(REFINEMENTS) - clock_refinements()
+        if given.fps is not None or given.timestamps is not None:
+            names |= clock_refinements() if given.image_size is not None else {"time_offset"}
+        return names
+
+
+def _fits(adjustment: Adjustment) -> bool:
+    """Whether the cameras agree with one another as those of one scene do."""
+    share = adjustment.last.inliers.sum() / adjustment.measurements.visible.sum()
+    noise = adjustment.last.sigma_px.median() / adjustment.measurements.cameras.focal_px.mean()
+    return adjustment.converged and float(share) > _FITTING_SHARE and float(noise) < _FITTING_FOCAL_SHARE
+
+
+def _median_squared_residual(adjustment: Adjustment) -> float:
+    """Of all keypoints, inliers and outliers, square pixels."""
+    squared = adjustment.measurements.squared_residuals(adjustment.state)
+    return float(squared[adjustment.measurements.visible].median())
