@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
-import doctest
 import importlib
 import json
 import pickle
-import pkgutil
 import sys
-from collections.abc import Iterator
+import textwrap
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
+import numpy as np
 import pytest
+import torch
 
 from torchstickcal import CalibrationError, ConfigError, FileFormatError, calibrate, io
 from torchstickcal.io import (
@@ -30,7 +31,7 @@ from torchstickcal.simulate import golf_session
 REGISTRIES = (SESSION_READERS, CALIBRATION_READERS, CALIBRATION_WRITERS)
 
 OWN = '''
-"""A folder with one text file per camera; its cameras; and a table of points."""
+"""Sessions as folders with one text file per camera; points as text."""
 
 from torchstickcal import Observations, Stick
 from torchstickcal.files import atomic_path
@@ -193,7 +194,20 @@ def test_a_name_is_registered_once(own_formats: None):
     assert CALIBRATION_WRITERS["pose2sim"].file_name == "b.toml"
 
 
-@pytest.mark.parametrize("name", ["", *(module.name for module in pkgutil.walk_packages(io.__path__, "."))])
-def test_examples_in_docstrings(name: str, own_formats: None):
-    """They register formats, which are forgotten afterwards."""
-    assert doctest.testmod(importlib.import_module(f"torchstickcal.io{name}")).failed == 0
+def example(decorator: Callable) -> None:
+    """Run the example in the description of a decorator."""
+    assert decorator.__doc__
+    exec(textwrap.dedent(decorator.__doc__.partition("Example::")[2]), {})
+
+
+def test_the_examples_of_the_decorators(own_formats: None, tmp_path: Path):
+    for decorator in (io.session_reader, io.calibration_reader, io.calibration_writer):
+        example(decorator)
+    (tmp_path / "a").write_text('{"toy": [[[[10, 20], [30, 40]]], [[[50, 60], [70, 80]]]]}')
+    assert read_session(tmp_path / "a")[0].keypoints.shape == (2, 1, 2, 2)
+    calibration = calibrate(golf_session(cameras=3, frames=10)[0])
+    with (tmp_path / "b").open("wb") as file:
+        np.save(file, torch.cat([calibration.intrinsics, calibration.rotations, calibration.translations[..., None]], dim=2))
+    assert read_calibration(tmp_path / "b").translations.equal(calibration.translations)
+    write_calibration(tmp_path / "c", calibration, "toy")
+    assert (tmp_path / "c").read_text() == "cam01\ncam02\ncam03"

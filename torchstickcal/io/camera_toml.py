@@ -33,8 +33,8 @@ _CAMERA_TABLE = re.compile(rb"^\[[^\[\].]+\]\s*\n(?:(?!\[).*\n)*?matrix\s*=", re
 def write_camera_toml(path: str | Path, calibration: Calibration) -> None:
     """Write the cameras of a calibration for Pose2Sim and aniposelib.
 
-    5 distortion coefficients are written for each camera (8 if the calibration has 8, 4 for fisheye lenses). If the image
-    size is not known, twice the principal point is written in its place.
+    The distortion coefficients of a camera are written in OpenCV's order: those of the calibration, with zeros up to 5 of
+    them (4 for fisheye lenses). If the image size is not known, twice the principal point is written in its place.
 
     Args:
         path: of the file.
@@ -130,7 +130,7 @@ def _camera(calibration: Calibration, index: int) -> str:
 
 
 def _distortion(calibration: Calibration, index: int) -> Tensor:
-    """The distortion coefficients of a camera, (4,) for a fisheye lens, else (5,) or (8,)."""
+    """The distortion coefficients of a camera, (4,) for a fisheye lens, else (D,) with D of 5 or more."""
     given = torch.zeros(5) if calibration.distortion is None else calibration.distortion[index].double().cpu()
     return given if calibration.fisheye else torch.nn.functional.pad(given, (0, max(0, 5 - len(given))))
 

@@ -102,22 +102,17 @@ def session_reader(
     Raises:
         ConfigError: if the name is in use.
 
-    Example:
-        >>> import json, pathlib, tempfile
-        >>> from torchstickcal import Observations, Stick
-        >>> from torchstickcal.io import read_session, session_reader
-        >>> def is_toy(path, head):
-        ...     return head.startswith(b'{"toy"')
-        >>> @session_reader("toy", "keypoints (C, F, P, 2) as JSON", recognises=is_toy)
-        ... def read_toy(path):
-        ...     keypoints = json.loads(path.read_text())["toy"]
-        ...     return Observations(keypoints, None, Stick(0, 1, length_m=1.0), image_size=(640, 480)), None
-        >>> with tempfile.TemporaryDirectory() as folder:
-        ...     path = pathlib.Path(folder, "session.json")
-        ...     _ = path.write_text('{"toy": [[[[10, 20], [30, 40]]], [[[50, 60], [70, 80]]]]}')
-        ...     observations, truth = read_session(path)
-        >>> observations.num_cameras, observations.num_frames, observations.num_points
-        (2, 1, 2)
+    Example::
+
+        import json
+
+        from torchstickcal import Observations, Stick
+        from torchstickcal.io import session_reader
+
+        @session_reader("toy", "keypoints (C, F, P, 2) as JSON", recognises=lambda path, head: head.startswith(b'{"toy"'))
+        def read_toy(path):
+            keypoints = json.loads(path.read_text())["toy"]
+            return Observations(keypoints, None, Stick(0, 1, length_m=1.2), image_size=(640, 480)), None
     """
 
     def register(function: _SessionFunction) -> _SessionFunction:
@@ -144,22 +139,25 @@ def calibration_reader(
     Raises:
         ConfigError: if the name is in use.
 
-    Example:
-        >>> import pathlib, tempfile, torch
-        >>> from torchstickcal.io import Rig, calibration_reader, read_calibration
-        >>> def is_toy(path, head):
-        ...     return head.startswith(b"translations")
-        >>> @calibration_reader("toy", "cameras that look in one direction", recognises=is_toy)
-        ... def read_toy(path):
-        ...     translations = torch.tensor([[float(n) for n in line.split()] for line in path.read_text().splitlines()[1:]])
-        ...     count = len(translations)
-        ...     eyes, lenses, sizes = torch.eye(3).expand(count, 3, 3), (torch.zeros(5),) * count, torch.ones(count, 2)
-        ...     return Rig(("left", "right"), eyes, lenses, (False,) * count, sizes, eyes, translations)
-        >>> with tempfile.TemporaryDirectory() as folder:
-        ...     path = pathlib.Path(folder, "cameras.txt")
-        ...     _ = path.write_text("translations\\n0 0 0\\n2 0 0")
-        ...     read_calibration(path).translations.tolist()
-        [[0.0, 0.0, 0.0], [2.0, 0.0, 0.0]]
+    Example::
+
+        import numpy as np
+        import torch
+        from torchstickcal.io import Rig, calibration_reader
+
+        @calibration_reader("toy", "camera matrices and poses as .npy", recognises=lambda path, head: b"NUMPY" in head[:6])
+        def read_toy(path):
+            matrices, rotations, translations = torch.from_numpy(np.load(path)).split([3, 3, 1], dim=2)  # (C, 3, 7)
+            count = len(matrices)
+            return Rig(
+                names=tuple(f"camera {number}" for number in range(count)),
+                intrinsics=matrices,
+                distortion=(torch.zeros(5, dtype=torch.float64),) * count,
+                fisheye=(False,) * count,
+                image_size=2 * matrices[:, :2, 2],
+                rotations=rotations,
+                translations=translations[..., 0],
+            )
     """
 
     def register(function: _RigFunction) -> _RigFunction:
@@ -186,22 +184,15 @@ def calibration_writer(
     Raises:
         ConfigError: if the name is in use.
 
-    Example:
-        >>> import pathlib, tempfile
-        >>> from torchstickcal import calibrate
-        >>> from torchstickcal.files import atomic_path
-        >>> from torchstickcal.io import calibration_writer, write_calibration
-        >>> from torchstickcal.simulate import golf_session
-        >>> @calibration_writer("names", "names of the cameras, one per line", file_name="names.txt")
-        ... def write_names(path, calibration):
-        ...     with atomic_path(path) as temporary:
-        ...         temporary.write_text("\\n".join(calibration.camera_names))
-        >>> calibration = calibrate(golf_session(cameras=3, frames=10)[0])
-        >>> with tempfile.TemporaryDirectory() as folder:
-        ...     path = pathlib.Path(folder, "names.txt")
-        ...     write_calibration(path, calibration, "names")
-        ...     path.read_text().splitlines()
-        ['cam01', 'cam02', 'cam03']
+    Example::
+
+        from torchstickcal.files import atomic_path
+        from torchstickcal.io import calibration_writer
+
+        @calibration_writer("toy", "names of the cameras, one per line", file_name="names.txt")
+        def write_toy(path, calibration):
+            with atomic_path(path) as temporary:
+                temporary.write_text("\\n".join(calibration.camera_names))
     """
 
     def register(function: _WriterFunction) -> _WriterFunction:
