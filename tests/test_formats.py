@@ -4,7 +4,10 @@ from __future__ import annotations
 
 import importlib
 import json
+import os
 import pickle
+import shutil
+import subprocess
 import sys
 import textwrap
 from collections.abc import Callable, Iterator
@@ -62,6 +65,16 @@ from torchstickcal.io.rig import Rig
 def read_wrapped(path) -> Rig:
     raise RuntimeError("no idea")
 '''
+
+
+BUILT_ON = """
+from torchstickcal.io.camera_toml import read_camera_toml
+from torchstickcal.io.formats import calibration_reader, session_reader
+from torchstickcal.io.npz import read_npz
+
+session_reader("aaa", "as npz", recognises=lambda path, head: False)(read_npz)
+calibration_reader("aaa", "as pose2sim", recognises=lambda path, head: False)(read_camera_toml)
+"""
 
 
 @pytest.fixture
@@ -182,6 +195,24 @@ def test_a_new_file_in_the_folder_is_found(own_formats: None, tmp_path: Path, mo
     (tmp_path / "a.txt").write_text("WRAP")
     with pytest.raises(FileFormatError, match=r"a\.txt.*RuntimeError: no idea; expected a calibration.toml behind a line"):
         read_calibration(tmp_path / "a.txt")
+
+
+def test_a_new_file_may_build_on_shipped_formats(tmp_path: Path):
+    """Whichever of the package's modules is imported first."""
+    package = Path(io.__file__).parents[1]
+    shutil.copytree(package, tmp_path / "torchstickcal", ignore=shutil.ignore_patterns("__pycache__"))
+    (tmp_path / "torchstickcal" / "io" / "aaa.py").write_text(BUILT_ON)
+    for module in ("io", "io.npz", "io.camera_toml", "io.aaa"):
+        code = f"import torchstickcal.{module}; from torchstickcal.io import SESSION_READERS as S; print(list(S))"
+        run = subprocess.run(
+            [sys.executable, "-c", code],
+            cwd=tmp_path,
+            env=os.environ | {"PYTHONPATH": str(tmp_path)},
+            capture_output=True,
+            text=True,
+            check=False,
+        )
+        assert "aaa" in run.stdout, run.stderr
 
 
 def test_a_name_is_registered_once(own_formats: None):
