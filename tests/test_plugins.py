@@ -138,6 +138,15 @@ def test_formats(plugin: str, session: Path, tmp_path: Path, capsys: pytest.Capt
     assert main(["evaluate", str(marked), str(session), "--plugin", plugin]) == 0
 
 
+def test_a_session_of_one_s_own_format_is_measured(plugin: str, session: Path, tmp_path: Path):
+    folder = tmp_path / "sessions"
+    folder.mkdir()
+    (folder / "notes.txt").write_text("not a session")
+    session.rename(folder / "swing")
+    assert main(["benchmark", str(folder), "--json", str(tmp_path / "b.json"), "--plugin", plugin]) == 0
+    assert [score["name"] for score in json.loads((tmp_path / "b.json").read_text())["sequences"]] == ["swing"]
+
+
 def test_two_files_of_one_name_are_refused(plugin: str, session: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     out = tmp_path / "out"
     assert main(["calibrate", str(session), "--out", str(out), "--export", "toy_report", "--plugin", plugin]) == 2
