@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import subprocess
 import sys
@@ -10,18 +11,10 @@ from pathlib import Path
 import pytest
 import torch
 
-from torchstickcal import Calibration, calibrate
+from torchstickcal import Calibration, Stick, calibrate
 from torchstickcal.cli import main
 from torchstickcal.io import read_camera_toml, write_npz
 from torchstickcal.simulate import Noise, golf_session
-
-
-@pytest.fixture(autouse=True)
-def threads():
-    """The command line sets torch's threads for its own process; here they are put back."""
-    count = torch.get_num_threads()
-    yield
-    torch.set_num_threads(count)
 
 
 def test_calibrating_leaves_torchs_threads_alone(noisy):
@@ -90,6 +83,23 @@ def test_stick_length_scales_the_rig(session: Path, tmp_path: Path):
     assert (2 * one - two).abs().max() < 0.02
 
 
+def test_stick_sigma_is_the_uncertainty_of_the_scale(session: Path, tmp_path: Path):
+    for sigma in ("0.001", "0.05"):
+        main(["calibrate", str(session), "--out", str(tmp_path / sigma), "--stick-sigma", sigma, "--refine", "none"])
+    known, guessed = (Calibration.load(tmp_path / sigma / "points.npz") for sigma in ("0.001", "0.05"))
+    assert guessed.sticks[0].sigma_m == 0.05
+    assert guessed.scale_std > 10 * known.scale_std
+
+
+def test_a_calibration_file_or_a_session_of_any_name_is_evaluated(session: Path, tmp_path: Path):
+    out = tmp_path / "results"
+    main(["calibrate", str(session), "--out", str(out)])
+    (out / "calibration.toml").rename(tmp_path / "cameras.txt")
+    session.rename(tmp_path / "truth")
+    assert main(["evaluate", str(tmp_path / "cameras.txt"), str(tmp_path / "truth")]) == 0
+    assert main(["evaluate", str(tmp_path / "cameras.txt"), str(tmp_path / "truth"), "--format", "npz"]) == 0
+
+
 def test_tensorboard_log(session: Path, tmp_path: Path):
     main(["calibrate", str(session), "--out", str(tmp_path / "out"), "--tensorboard", str(tmp_path / "log")])
     assert len(list((tmp_path / "log").iterdir())) == 1
@@ -130,7 +140,19 @@ def test_the_same_command_writes_the_same_cameras(session: Path, tmp_path: Path)
         (["calibrate", "absent.npz", "--out", "out"], "No such file"),
         (["calibrate", "SESSION", "--out", "out", "--config", "papr"], "Did you mean 'paper'"),
         (["calibrate", "SESSION", "--out", "out", "--stick-length", "1150"], "millimetres"),
-        (["calibrate", "SESSION", "--out", "out", "--threads", "0"], "no threads"),
+        (["calibrate", "SESSION", "--out", "out", "--stick-sigma", "-1"], "not a length (Stick.sigma_m): got -1"),
+        (["calibrate", "TWO", "--out", "out", "--stick-sigma", "0.01"], "with one stick (--stick-sigma): got 2 sticks"),
+        (["calibrate", "SESSION", "--out", "out", "--refine", "focal,redial"], "Did you mean 'radial'"),
+        (["calibrate", "SESSION", "--out", "out", "--refine", "time_offset", "--no-sync"], "got --refine time_offset"),
+        (["calibrate", "SESSION", "--out", "out", "--format", "npx"], "Did you mean 'npz'"),
+        (["calibrate", "SESSION", "--out", "out", "--format", "sports-stick-syn"], "a pickle file is damaged"),
+        (["calibrate", "SESSION", "--out", "out", "--export", "pose3sim"], "Did you mean 'pose2sim'"),
+        (["calibrate", "empty", "--out", "out"], "no session format is recognised (empty): got a folder"),
+        (["evaluate", "SESSION", "broken.py"], "no calibration format or session format is recognised"),
+        (["list", "--plugin", "absent.py"], "a plugin cannot be imported (--plugin absent.py): got FileNotFoundError"),
+        (["list", "--plugin", "absent.module"], "got ModuleNotFoundError: No module named 'absent'"),
+        (["list", "--plugin", "broken.py"], "got ZeroDivisionError: division by zero; expected"),
+        (["list", "--plugin", "script.py"], "got SystemExit: 3; expected"),
         (["evaluate", "SESSION", "FOUR"], "number of cameras differs"),
         (["benchmark", "EMPTY"], "no sessions"),
     ],
@@ -140,8 +162,13 @@ def test_errors_are_one_line_and_leave_nothing(
 ):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "empty").mkdir()
+    (tmp_path / "broken.py").write_text("1 / 0")
+    (tmp_path / "script.py").write_text("import sys; sys.exit(3)")
+    observations, truth = golf_session(cameras=3, frames=5)
+    sticks = [*observations.sticks, Stick("right_knee", "right_ankle", 0.42)]
+    write_npz(tmp_path / "two.npz", dataclasses.replace(observations, sticks=sticks), truth)
     write_npz(tmp_path / "four.npz", *golf_session(cameras=4, frames=5))
-    places = {"SESSION": str(session), "FOUR": "four.npz", "EMPTY": "empty"}
+    places = {"SESSION": str(session), "FOUR": "four.npz", "TWO": "two.npz", "EMPTY": "empty"}
     assert main([places.get(argument, argument) for argument in arguments]) == 2
     error = capsys.readouterr().err
     assert error.startswith("error: ")
@@ -153,7 +180,7 @@ def test_errors_are_one_line_and_leave_nothing(
 def test_help_and_usage_errors_do_not_wait_for_torch():
     code = (
         "import sys\nfrom torchstickcal.cli import main\n"
-        "for arguments in (['--help'], ['calibrate', '--help'], ['nonsense']):\n"
+        "for arguments in (['--help'], ['calibrate', '--help'], ['list', '--help'], ['nonsense']):\n"
         "    try:\n        main(arguments)\n    except SystemExit:\n        pass\n"
         "assert not {'torch', 'numpy', 'kornia', 'cv2', 'matplotlib'} & set(sys.modules)"
     )

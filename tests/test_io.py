@@ -12,9 +12,17 @@ import numpy as np
 import pytest
 import torch
 
-from torchstickcal import Calibration, FileFormatError, calibrate
+from torchstickcal import Calibration, FileFormatError, Observations, Stick, calibrate
 from torchstickcal.files import atomic_path
-from torchstickcal.io import read_camera_toml, read_npz, read_session, read_sports_stick_syn, write_camera_toml, write_npz
+from torchstickcal.io import (
+    read_calibration,
+    read_camera_toml,
+    read_npz,
+    read_session,
+    read_sports_stick_syn,
+    write_camera_toml,
+    write_npz,
+)
 
 
 def syn_pickle(path: Path, **changes: object) -> Path:
@@ -72,7 +80,7 @@ class Hostile:
 def test_a_hostile_pickle_is_refused_and_nothing_of_it_runs(tmp_path: Path):
     path, trace = tmp_path / "bad.pkl", tmp_path / "trace"
     path.write_bytes(pickle.dumps({"K": Hostile(trace)}))
-    with pytest.raises(FileFormatError, match=r"damaged or not plain data.*bad\.pkl.*mkdir"):
+    with pytest.raises(FileFormatError, match=r"damaged or holds more than plain data.*bad\.pkl.*mkdir"):
         read_session(path)
     assert not trace.exists()
 
@@ -84,18 +92,22 @@ def test_damaged_pickles_are_refused(tmp_path: Path):
     with pytest.raises(FileFormatError, match="damaged"):
         read_sports_stick_syn(path)
     path.write_bytes(pickle.dumps({"K": 1}))
-    with pytest.raises(FileFormatError, match=r"not a usable session.*all_pose_projections_2d"):
+    with pytest.raises(FileFormatError, match=r"not of the expected format.*a\.pkl.*all_pose_projections_2d.*Sports-Stick-Syn"):
         read_sports_stick_syn(path)
     path.write_bytes(pickle.dumps([1, 2]))
-    with pytest.raises(FileFormatError, match="not a usable session"):
+    with pytest.raises(FileFormatError, match="not of the expected format"):
         read_sports_stick_syn(path)
 
 
 def test_unknown_and_missing_files(tmp_path: Path):
     path = tmp_path / "a.txt"
     path.write_text("hello")
-    with pytest.raises(FileFormatError, match="unknown kind of session"):
+    with pytest.raises(FileFormatError, match=r"no session format is recognised .*a\.txt.*b'hello'.*npz = NumPy"):
         read_session(path)
+    with pytest.raises(FileFormatError, match=r"no calibration format is recognised .*b'hello'.*pose2sim = "):
+        read_calibration(path)
+    with pytest.raises(FileFormatError, match="got a folder"):
+        read_session(tmp_path)
     with pytest.raises(FileNotFoundError):
         read_session(tmp_path / "absent.npz")
 
@@ -114,12 +126,46 @@ def test_npz_round_trip(tmp_path: Path, noisy):
     assert torch.equal(back_truth.points, truth.points)
 
 
+def test_npz_keeps_everything(tmp_path: Path, noisy):
+    """What few sessions have: sticks named by their ends, tolerances, a guessed camera matrix, timestamps, a read-out time."""
+    given, _ = noisy
+    observations = Observations(
+        given.keypoints.float(),
+        None,
+        [Stick("club_grip", "club_head", 1.0, sigma_m=0.003), Stick("right_knee", "right_ankle", 0.42, sigma_m=0.02)],
+        image_size=(1920, 1080),
+        point_names=given.point_names,
+        timestamps=np.arange(30) / 60.0,
+        readout_s=0.012,
+    )
+    write_npz(tmp_path / "a.npz", observations)
+    back, truth = read_npz(tmp_path / "a.npz")
+    assert truth is None
+    for field in dataclasses.fields(Observations):
+        value, other = getattr(observations, field.name), getattr(back, field.name)
+        if isinstance(value, torch.Tensor):
+            torch.testing.assert_close(other, value, rtol=0, atol=0, equal_nan=True)
+        else:
+            assert other == value, field.name
+    assert [stick.sigma_m for stick in back.sticks] == [0.003, 0.02]
+    assert not back.intrinsics_known
+
+
+def test_npz_without_tolerances_has_sticks_with_the_usual_one(tmp_path: Path, noisy):
+    write_npz(tmp_path / "a.npz", *noisy)
+    with np.load(tmp_path / "a.npz") as file:
+        arrays = {name: file[name] for name in file.files if name != "stick_sigma_m"}
+    np.savez(tmp_path / "b.npz", **arrays)
+    (stick,) = read_npz(tmp_path / "b.npz")[0].sticks
+    assert stick.sigma_m == Stick(0, 1, 1.0).sigma_m
+
+
 def test_npz_without_its_arrays_is_refused(tmp_path: Path):
     np.savez(tmp_path / "a.npz", keypoints=np.zeros((2, 3, 4, 2)))
-    with pytest.raises(FileFormatError, match=r"not a usable session.*stick_start"):
+    with pytest.raises(FileFormatError, match=r"not of the expected format.*no 'intrinsics'"):
         read_npz(tmp_path / "a.npz")
     (tmp_path / "b.npz").write_bytes(b"PK\x03\x04 nonsense")
-    with pytest.raises(FileFormatError, match="not a usable session"):
+    with pytest.raises(FileFormatError, match="damaged"):
         read_session(tmp_path / "b.npz")
 
 
@@ -191,7 +237,7 @@ def test_files_that_hold_no_cameras_are_refused(tmp_path: Path):
     path = tmp_path / "calibration.toml"
     for text in ("[metadata]\nerror = 1.0\n", "[cam_0]\nname = 'a'\n", "= 3", "cam = 3"):
         path.write_text(text)
-        with pytest.raises(FileFormatError, match="not a camera file"):
+        with pytest.raises(FileFormatError, match="not of the expected format"):
             read_camera_toml(path)
 
 

@@ -9,12 +9,16 @@ from __future__ import annotations
 import difflib
 import importlib
 import pkgutil
+import sys
 from collections.abc import Iterable, Iterator, Mapping
 from typing import Any, TypeVar
 
 from torchstickcal.errors import ConfigError
 
 _Thing = TypeVar("_Thing")
+
+_being_imported: set[str] = set()
+"""The folders whose modules are being imported by a registry."""
 
 
 class Registry(Mapping[str, _Thing]):
@@ -49,7 +53,8 @@ class Registry(Mapping[str, _Thing]):
         Raises:
             ConfigError: if the name is taken.
         """
-        self._import_shipped()
+        if not self._is_being_imported():
+            self._import_shipped()
         if name in self._things and not replace:
             raise ConfigError(
                 f"there is a {self.kind} of that name already",
@@ -105,6 +110,8 @@ class Registry(Mapping[str, _Thing]):
         if self._imported:
             return
         self._imported = True
+        outermost = self._folder not in _being_imported
+        _being_imported.add(self._folder)
         try:
             package = importlib.import_module(self._folder)
             for name in sorted(module.name for module in pkgutil.iter_modules(package.__path__)):
@@ -112,6 +119,17 @@ class Registry(Mapping[str, _Thing]):
         except BaseException:
             self._imported = False
             raise
+        finally:
+            if outermost:
+                _being_imported.discard(self._folder)
+
+    def _is_being_imported(self) -> bool:
+        """Whether the folder's modules are being imported, so that one of them may be registering what it defines.
+
+        Importing the others then would give an incomplete module to those that build on the one that is registering.
+        """
+        package = getattr(sys.modules.get(self._folder), "__spec__", None)
+        return self._folder in _being_imported or getattr(package, "_initializing", False)
 
 
 def suggestion(name: str, known: Iterable[str]) -> str:

@@ -11,13 +11,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torchstickcal.errors import CalibrationError, FileFormatError
-from torchstickcal.io import Truth, read_session
+from torchstickcal.io import SESSION_READERS, Truth, find_reader
 from torchstickcal.observations import Observations
 from torchstickcal.simulate import PRESETS, SPORTS, Cube, CubeViews, SessionSpec, SimulatedSession, preset, read_simulated
 from torchstickcal.simulate.rigs import CameraRig
 from torchstickcal.simulate.skeleton import STANDING_HEIGHT_M
 
-_SUFFIXES = {".npz", ".pkl"}
 _NOISE = re.compile(r"_noise(\d+(?:\.\d+)?)(?:_|$)")
 
 
@@ -87,23 +86,24 @@ class Source:
         """
         if isinstance(self.origin, SessionSpec):
             return _of_simulated(self.origin.generate())
-        if self.origin.suffix == ".npz":
+        reader = find_reader(self.origin, SESSION_READERS)
+        if reader is SESSION_READERS["npz"]:
             try:
                 return replace(_of_simulated(read_simulated(self.origin)), name=self.name)
             except FileFormatError:
                 pass
-        observations, truth = read_session(self.origin)
+        observations, truth = reader.read(self.origin)
         if truth is None:
             return None
         case = Case(self.name, observations, truth)
-        return case if self.origin.suffix == ".npz" else _completed(case)
+        return _completed(case) if reader is SESSION_READERS["sports-stick-syn"] else case
 
 
 def sources(place: str, count: int | None = None) -> tuple[Source, ...]:
     """The cases of a folder, sorted by name, or of a preset, in its order.
 
     Args:
-        place: a folder of sessions (.npz or .pkl), or the name of a preset.
+        place: a folder of sessions of any known format, or the name of a preset. Other files in the folder are ignored.
         count: number of cases, from the first one; None for all.
 
     Raises:
@@ -116,16 +116,26 @@ def sources(place: str, count: int | None = None) -> tuple[Source, ...]:
     """
     folder = Path(place)
     if folder.is_dir():
-        files = sorted(path for path in folder.iterdir() if path.suffix in _SUFFIXES)
-        if not files:
-            raise FileFormatError("no sessions", where=place, got="no such files", expected="files .npz or .pkl")
-        found = tuple(Source(path.stem, path) for path in files)
+        paths = sorted(filter(_is_session, folder.iterdir()))
+        if not paths:
+            expected = f"sessions of a known format: {', '.join(SESSION_READERS)}"
+            raise FileFormatError("no sessions", where=place, got="none in the folder", expected=expected)
+        found = tuple(Source(path.stem, path) for path in paths)
     elif place in PRESETS:
         found = tuple(Source(spec.name, spec) for spec in preset(place))
     else:
         expected = f"a folder of sessions, or a preset: {', '.join(PRESETS)}"
         raise CalibrationError("no such folder or preset", where="benchmark", got=repr(place), expected=expected)
     return found[:count]
+
+
+def _is_session(path: Path) -> bool:
+    """Whether a file or a folder is a session of a known format, even if it is damaged."""
+    try:
+        find_reader(path, SESSION_READERS)
+    except FileFormatError:
+        return False
+    return True
 
 
 def _of_simulated(session: SimulatedSession) -> Case:

@@ -61,7 +61,13 @@ Progress = Callable[[int, int, str], None]
 
 
 def run_benchmark(
-    place: str, cases: Sequence[Source], methods: Sequence[str], out: Path, jobs: int = 1, progress: Progress | None = None
+    place: str,
+    cases: Sequence[Source],
+    methods: Sequence[str],
+    out: Path,
+    jobs: int = 1,
+    progress: Progress | None = None,
+    prepare: Callable[[], object] | None = None,
 ) -> list[Row]:
     """Measure methods on cases, except for what the folder ``out`` already holds.
 
@@ -72,9 +78,10 @@ def run_benchmark(
         cases: their sources; cases without truth are skipped.
         methods: names of the methods.
         out: folder of the results; created if it does not exist.
-        jobs: number of processes, each with one thread. With more than one, sports and baselines of your own must be
-            registered in a module that your main script imports.
+        jobs: number of processes, each with one thread.
         progress: called after each measurement.
+        prepare: with more than one process, called first in each of them: it imports the modules that register losses, sports
+            or baselines of your own, for example ``functools.partial(importlib.import_module, "my_baselines")``.
 
     Returns:
         The rows of these cases and methods, in their order, measured now or earlier.
@@ -107,7 +114,7 @@ def run_benchmark(
     wanted = [(source, name) for source in cases for name in methods]
     missing = [(source, name) for source, name in wanted if (source.name, name) not in known]
     with file.open("a", encoding="utf-8") as stream:
-        for done, row in enumerate(_measured(place, missing, jobs), len(wanted) - len(missing) + 1):
+        for done, row in enumerate(_measured(place, missing, jobs, prepare), len(wanted) - len(missing) + 1):
             if row is not None:
                 known[row.case, row.method] = row
                 stream.write(json.dumps(asdict(row)) + "\n")
@@ -202,7 +209,9 @@ def _called(name: str, measured: Method, case: Case) -> _Result:
         return _Result(FAILED, f"{type(error).__name__}: {error}".splitlines()[0], seconds)
 
 
-def _measured(place: str, missing: Sequence[tuple[Source, str]], jobs: int) -> Iterator[Row | None]:
+def _measured(
+    place: str, missing: Sequence[tuple[Source, str]], jobs: int, prepare: Callable[[], object] | None
+) -> Iterator[Row | None]:
     """The rows of cases and methods, as they are finished."""
     if jobs == 1 or not missing:
         threads = torch.get_num_threads()
@@ -213,13 +222,20 @@ def _measured(place: str, missing: Sequence[tuple[Source, str]], jobs: int) -> I
             torch.set_num_threads(threads)
         return
     context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(min(jobs, len(missing)), context, initializer=torch.set_num_threads, initargs=(1,)) as pool:
+    with ProcessPoolExecutor(min(jobs, len(missing)), context, initializer=_start, initargs=(prepare,)) as pool:
         try:
             for future in as_completed([pool.submit(measure, place, source, name) for source, name in missing]):
                 yield future.result()
         except BaseException:
             pool.shutdown(cancel_futures=True)
             raise
+
+
+def _start(prepare: Callable[[], object] | None) -> None:
+    """Make a new process ready to measure."""
+    torch.set_num_threads(1)
+    if prepare:
+        prepare()
 
 
 @lru_cache(maxsize=4)

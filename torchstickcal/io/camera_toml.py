@@ -1,14 +1,14 @@
-"""``calibration.toml``: cameras as Pose2Sim and aniposelib read them.
+"""Calibration files of Pose2Sim and aniposelib (``calibration.toml``).
 
-One table per camera, world to camera, rotation vectors, metres. Both programs take every top-level table other than
-``metadata`` for a camera; keys are zero-padded because aniposelib sorts them as text.
+One table per camera: world to camera, rotation vectors, metres. Both programs take every top-level table other than
+``metadata`` for a camera. aniposelib sorts the names of the tables as text, so their numbers are written with leading zeros.
 """
 
 from __future__ import annotations
 
 import json
+import re
 import tomllib
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -17,73 +17,89 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchstickcal.errors import FileFormatError
 from torchstickcal.files import atomic_path
+from torchstickcal.io.formats import calibration_reader, calibration_writer, reading
+from torchstickcal.io.rig import Rig
 from torchstickcal.result import Calibration
 
+_NAME = "pose2sim"
+_DESCRIPTION = "cameras of Pose2Sim or aniposelib, in metres (.toml)"
 _NOT_CAMERAS = {"metadata", "capture_volume", "charuco", "checkerboard"}
+_CAMERA_TABLE = re.compile(rb"^\[[^\[\].]+\]\s*\n(?:(?!\[).*\n)*?matrix\s*=", re.MULTILINE)
+"""A top-level table with a camera matrix."""
 
 
-@dataclass(frozen=True, eq=False)
-class Rig:
-    """The cameras of a calibration file, float64, metres."""
-
-    names: tuple[str, ...]
-    intrinsics: Tensor
-    """(C, 3, 3)"""
-    distortion: tuple[Tensor, ...]
-    """C vectors, OpenCV's order"""
-    fisheye: tuple[bool, ...]
-    image_size: Tensor
-    """(C, 2)"""
-    rotations: Tensor
-    """(C, 3, 3), world to camera"""
-    translations: Tensor
-    """(C, 3), world to camera"""
-
-
+@calibration_writer(_NAME, _DESCRIPTION, file_name="calibration.toml")
 def write_camera_toml(path: str | Path, calibration: Calibration) -> None:
-    """Write the cameras of a calibration.
+    """Write the cameras of a calibration for Pose2Sim and aniposelib.
 
-    Lenses are written with 5 coefficients (8 where the model has them, 4 for fisheye lenses). Where the image size is not
-    known, twice the principal point stands for it.
-    """
-    count = len(calibration.camera_names)
-    intrinsics = calibration.intrinsics.double().cpu()
-    sizes = 2 * intrinsics[:, :2, 2] if calibration.image_size is None else calibration.image_size.double().cpu()
-    lenses = torch.zeros(count, 5) if calibration.distortion is None else calibration.distortion.double().cpu()
-    lenses = lenses if calibration.fisheye else torch.nn.functional.pad(lenses, (0, max(0, 5 - lenses.shape[1])))
-    lines: list[str] = []
-    for index, name in enumerate(calibration.camera_names):
-        rotation, _ = cv2.Rodrigues(calibration.rotations[index].double().cpu().numpy())
-        lines += [
-            f"[cam_{index:0{len(str(count - 1))}d}]",
-            f"name = {json.dumps(name, ensure_ascii=False)}",
-            f"size = {sizes[index].tolist()}",
-            f"matrix = {intrinsics[index].tolist()}",
-            f"distortions = {lenses[index].tolist()}",
-            f"rotation = {rotation[:, 0].tolist()}",
-            f"translation = {calibration.translations[index].double().cpu().tolist()}",
-            f"fisheye = {str(calibration.fisheye).lower()}",
-            "",
-        ]
-    error = float(calibration.reprojection_median_px.mean())
-    lines += ["[metadata]", "adjusted = false", f"error = {error!r}", 'units = "m"', 'generator = "torchstickcal"', ""]
-    with atomic_path(path) as temporary:
-        temporary.write_text("\n".join(lines), "utf-8")
+    The distortion coefficients of a camera are written in OpenCV's order: those of the calibration, with zeros up to 5 of
+    them (4 for fisheye lenses). If the image size is not known, twice the principal point is written in its place.
 
-
-def read_camera_toml(path: str | Path) -> Rig:
-    """Read the cameras of a file as Pose2Sim, aniposelib or :func:`write_camera_toml` write it, in the order of the file.
+    Args:
+        path: of the file.
+        calibration: the calibration.
 
     Raises:
-        FileFormatError: if the file is not TOML or has no complete camera.
+        OSError: if the file cannot be written.
+
+    Example:
+        >>> import tempfile
+        >>> from torchstickcal import calibrate
+        >>> from torchstickcal.io import read_camera_toml, write_camera_toml
+        >>> from torchstickcal.simulate import golf_session
+        >>> calibration = calibrate(golf_session(cameras=3, frames=10)[0])
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     write_camera_toml(f"{folder}/calibration.toml", calibration)
+        ...     rig = read_camera_toml(f"{folder}/calibration.toml")
+        >>> bool((rig.translations == calibration.translations).all())
+        True
     """
-    try:
+    count = len(calibration.camera_names)
+    names = [f"cam_{number:0{len(str(count - 1))}d}" for number in range(count)]
+    tables = [f"[{name}]\n{_camera(calibration, number)}" for number, name in enumerate(names)]
+    with atomic_path(path) as temporary:
+        temporary.write_text("\n".join([*tables, _metadata(calibration)]), "utf-8")
+
+
+@calibration_reader(_NAME, _DESCRIPTION, recognises=lambda path, head: _CAMERA_TABLE.search(head) is not None)
+def read_camera_toml(path: str | Path) -> Rig:
+    """Read a calibration file of Pose2Sim or aniposelib.
+
+    Args:
+        path: of the file.
+
+    Returns:
+        The cameras, in the order of the file.
+
+    Raises:
+        FileFormatError: if the file is not TOML, holds no camera, or one whose values are not complete.
+        OSError: if the file cannot be opened.
+
+    Example:
+        >>> import pathlib, tempfile
+        >>> from torchstickcal.io import read_camera_toml
+        >>> text = '''
+        ... [cam_0]
+        ... name = "left"
+        ... size = [640.0, 480.0]
+        ... matrix = [[500.0, 0.0, 320.0], [0.0, 500.0, 240.0], [0.0, 0.0, 1.0]]
+        ... distortions = [0.0, 0.0, 0.0, 0.0]
+        ... rotation = [0.0, 0.0, 0.0]
+        ... translation = [0.0, 0.0, 2.5]
+        ... '''
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     path = pathlib.Path(folder, "calibration.toml")
+        ...     _ = path.write_text(text)
+        ...     rig = read_camera_toml(path)
+        >>> rig.names, rig.translations.tolist()
+        (('left',), [[0.0, 0.0, 2.5]])
+    """
+    with reading(path, _DESCRIPTION):
         tables: dict[str, Any] = tomllib.loads(Path(path).read_text("utf-8"))
         cameras = {key: table for key, table in tables.items() if key not in _NOT_CAMERAS}
         if not cameras:
-            raise KeyError("camera tables")
+            raise KeyError("table of a camera")
         rotations = [cv2.Rodrigues(np.array(camera["rotation"], dtype=np.float64))[0] for camera in cameras.values()]
         return Rig(
             names=tuple(str(camera.get("name", key)) for key, camera in cameras.items()),
@@ -94,10 +110,34 @@ def read_camera_toml(path: str | Path) -> Rig:
             rotations=torch.from_numpy(np.stack(rotations)),
             translations=_stacked(cameras, "translation"),
         )
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError, KeyError, TypeError, ValueError, AttributeError, cv2.error) as error:
-        raise FileFormatError(
-            "not a camera file", where=str(path), got=repr(error), expected="a calibration.toml of Pose2Sim or aniposelib"
-        ) from error
+
+
+def _camera(calibration: Calibration, index: int) -> str:
+    """The lines of a camera's table."""
+    matrix = calibration.intrinsics[index].double().cpu()
+    size = 2 * matrix[:2, 2] if calibration.image_size is None else calibration.image_size[index].double().cpu()
+    rotation, _ = cv2.Rodrigues(calibration.rotations[index].double().cpu().numpy())
+    values = {
+        "name": json.dumps(calibration.camera_names[index], ensure_ascii=False),
+        "size": size.tolist(),
+        "matrix": matrix.tolist(),
+        "distortions": _distortion(calibration, index).tolist(),
+        "rotation": rotation[:, 0].tolist(),
+        "translation": calibration.translations[index].double().cpu().tolist(),
+        "fisheye": str(calibration.fisheye).lower(),
+    }
+    return "".join(f"{key} = {value}\n" for key, value in values.items())
+
+
+def _distortion(calibration: Calibration, index: int) -> Tensor:
+    """The distortion coefficients of a camera, (4,) for a fisheye lens, else (D,) with D of 5 or more."""
+    given = torch.zeros(5) if calibration.distortion is None else calibration.distortion[index].double().cpu()
+    return given if calibration.fisheye else torch.nn.functional.pad(given, (0, max(0, 5 - len(given))))
+
+
+def _metadata(calibration: Calibration) -> str:
+    error = float(calibration.reprojection_median_px.mean())
+    return f'[metadata]\nadjusted = false\nerror = {error!r}\nunits = "m"\ngenerator = "torchstickcal"\n'
 
 
 def _stacked(cameras: dict[str, Any], key: str) -> Tensor:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 from torchstickcal.errors import CalibrationError
-from torchstickcal.io.session import Truth
+from torchstickcal.io import Truth
 from torchstickcal.observations import Observations
 from torchstickcal.simulate.clocks import Clocks
 from torchstickcal.simulate.cube import Cube

@@ -11,7 +11,7 @@ import torch
 from numpy.typing import NDArray
 
 from torchstickcal.errors import FileFormatError
-from torchstickcal.io.session import Truth, read_npz, write_npz
+from torchstickcal.io import Truth, read_npz, write_npz
 from torchstickcal.observations import Observations
 from torchstickcal.simulate.athlete import Motion
 from torchstickcal.simulate.clocks import Clocks, exposed_points

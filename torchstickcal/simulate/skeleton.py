@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torchstickcal.errors import CalibrationError
-from torchstickcal.io.session import SPORTS_STICK_SYN_JOINTS
+from torchstickcal.io import SPORTS_STICK_SYN_JOINTS
 
 Array = NDArray[np.float64]
 

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from torchstickcal.benchmark.baselines.base import Array
 from torchstickcal.benchmark.baselines.joints import BONES
-from torchstickcal.io.session import SPORTS_STICK_SYN_JOINTS
+from torchstickcal.io import SPORTS_STICK_SYN_JOINTS
 
 
 def limb_orientations(

@@ -1,0 +1,157 @@
+"""The arguments of every command."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import Any
+
+from torchstickcal.cli.benchmark import benchmark
+from torchstickcal.cli.calibrate import calibrate_session
+from torchstickcal.cli.evaluate import evaluate
+from torchstickcal.cli.listing import LISTS, list_names
+from torchstickcal.cli.simulate import demo, simulate
+
+
+def parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="torchstickcal",
+        description="Calibrate a camera rig, in metres, from an athlete's keypoints and a stick of known length.",
+    )
+    commands = parser.add_subparsers(metavar="COMMAND", required=True)
+    for add in (_add_calibrate, _add_evaluate, _add_benchmark, _add_simulate, _add_demo, _add_list):
+        add(commands)
+    return parser
+
+
+def _add_calibrate(commands: Any) -> None:
+    command = commands.add_parser("calibrate", help="calibrate a session", description="Calibrate a session.")
+    command.add_argument("session", metavar="SESSION", type=Path, help="file or folder of a session")
+    _add_out(command, "results")
+    _add_format(command, "SESSION")
+    _add_config(command)
+    command.add_argument(
+        "--refine",
+        metavar="A,B|auto|none",
+        help="what to estimate of the cameras beside their poses: names from `torchstickcal list unknowns`, `none`, or `auto` "
+        "for what the keypoints contradict (default: as in the configuration, else auto)",
+    )
+    command.add_argument("--no-sync", action="store_true", help="do not estimate clocks: the cameras are synchronised")
+    command.add_argument(
+        "--stick-length", metavar="M", type=float, help="length of the stick in metres (default: the session's)"
+    )
+    command.add_argument(
+        "--stick-sigma",
+        metavar="M",
+        type=float,
+        help="standard deviation of that length in metres: how well it is known (default: the session's)",
+    )
+    command.add_argument(
+        "--export", metavar="A,B", help="write the calibration also in these formats, from `torchstickcal list formats`"
+    )
+    command.add_argument("--tensorboard", metavar="DIR", type=Path, help="write a TensorBoard log of the calibration")
+    _add_plugin(command)
+    command.set_defaults(run=calibrate_session)
+
+
+def _add_evaluate(commands: Any) -> None:
+    command = commands.add_parser(
+        "evaluate", help="compare a calibration with the truth", description="Compare a calibration with the truth."
+    )
+    command.add_argument("calibration", metavar="DIR", type=Path, help="folder that `calibrate` wrote, or a calibration file")
+    command.add_argument(
+        "truth", metavar="TRUTH", type=Path, help="a session that holds its truth, or a calibration as for DIR"
+    )
+    _add_format(command, "TRUTH, if it is a session")
+    command.add_argument("--json", metavar="FILE", type=Path, help="write the errors as JSON")
+    _add_plugin(command)
+    command.set_defaults(run=evaluate)
+
+
+def _add_benchmark(commands: Any) -> None:
+    command = commands.add_parser(
+        "benchmark",
+        help="measure errors on sessions with truth",
+        description="Measure the errors of a configuration on sessions with truth, or with --out those of all methods, with "
+        "tables and figures.",
+    )
+    command.add_argument(
+        "place", metavar="DIR|PRESET", help="folder of sessions, or a preset from `torchstickcal list presets`"
+    )
+    command.add_argument("--count", metavar="N", type=int, help="only the first N sessions")
+    command.add_argument("--json", metavar="FILE", type=Path, help="write the errors as JSON (without --out)")
+    _add_config(command)
+    command.add_argument("--out", metavar="DIR", type=Path, help="folder for the results; what it holds is not measured again")
+    command.add_argument(
+        "--methods",
+        metavar="A,B",
+        help="with --out: names from `torchstickcal list configs` and `torchstickcal list baselines` (default: all)",
+    )
+    command.add_argument("--jobs", metavar="N", type=int, default=1, help="with --out: number of processes (default: 1)")
+    _add_plugin(command)
+    command.set_defaults(run=benchmark)
+
+
+def _add_simulate(commands: Any) -> None:
+    command = commands.add_parser(
+        "simulate",
+        help="generate sessions with truth",
+        description="Generate sessions with truth: a preset, or a sport seen by six cameras.",
+    )
+    command.add_argument(
+        "name", metavar="PRESET|SPORT", help="name from `torchstickcal list presets` or `torchstickcal list sports`"
+    )
+    _add_out(command, "sessions")
+    command.add_argument("--count", metavar="N", type=int, help="number of sessions (default: all of a preset, one of a sport)")
+    command.add_argument("--seed", metavar="N", type=int, default=0, help="added to the seeds of the sessions (default: 0)")
+    command.add_argument("--gif", action="store_true", help="also write an animation of each session")
+    _add_plugin(command)
+    command.set_defaults(run=simulate)
+
+
+def _add_demo(commands: Any) -> None:
+    command = commands.add_parser(
+        "demo",
+        help="calibrate a simulated golf swing",
+        description="Simulate a golf swing seen by six cameras, with noise, gaps and outliers; calibrate it; show the result.",
+    )
+    command.add_argument("--out", metavar="DIR", type=Path, default=Path("demo"), help="folder for the results (default: demo)")
+    command.add_argument("--seed", metavar="N", type=int, default=0, help="seed of all random numbers (default: 0)")
+    command.set_defaults(run=demo, plugin=())
+
+
+def _add_list(commands: Any) -> None:
+    command = commands.add_parser(
+        "list",
+        help="list configurations, file formats, losses and whatever else has a name",
+        description="List what the other commands take by name.",
+    )
+    command.add_argument("kind", nargs="?", choices=list(LISTS), help="what to list (default: everything)")
+    _add_plugin(command)
+    command.set_defaults(run=list_names)
+
+
+def _add_out(command: argparse.ArgumentParser, what: str) -> None:
+    help = f"folder for the {what}; created if it does not exist"
+    command.add_argument("--out", metavar="DIR", type=Path, required=True, help=help)
+
+
+def _add_config(command: argparse.ArgumentParser) -> None:
+    help = "name from `torchstickcal list configs`, or a TOML file (default: default)"
+    command.add_argument("--config", metavar="NAME|FILE", default="default", help=help)
+
+
+def _add_format(command: argparse.ArgumentParser, what: str) -> None:
+    help = f"format of {what}: name from `torchstickcal list formats` (default: recognised by the content)"
+    command.add_argument("--format", metavar="NAME", help=help)
+
+
+def _add_plugin(command: argparse.ArgumentParser) -> None:
+    command.add_argument(
+        "--plugin",
+        metavar="MODULE|FILE.py",
+        action="append",
+        default=[],
+        help="a Python module of yours that registers losses, camera unknowns, file formats, sports or baselines; may be given "
+        "several times. It is a program that is run with your rights: use only what you trust",
+    )

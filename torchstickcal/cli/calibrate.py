@@ -1,0 +1,107 @@
+"""The command `calibrate`."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from torchstickcal.cli.outputs import chosen_writers, show_results, write_results
+from torchstickcal.errors import CalibrationError
+
+if TYPE_CHECKING:
+    from torchstickcal.config import Config
+    from torchstickcal.observations import Observations
+    from torchstickcal.pipeline.calibrate import Callback
+    from torchstickcal.result import Calibration
+    from torchstickcal.solvers import IterationRecord
+
+
+def calibrate_session(options: argparse.Namespace) -> int:
+    from torchstickcal.config import load_config
+    from torchstickcal.io import read_session
+    from torchstickcal.pipeline.calibrate import calibrate
+
+    config, refine = _refining(load_config(options.config), options.refine, options.no_sync)
+    writers = chosen_writers(options.export)
+    observations, _ = read_session(options.session, options.format)
+    observations = _with_stick(observations, options.stick_length, options.stick_sigma)
+    calibration = calibrate(observations, config, Progress(_monitor(options.tensorboard)), refine)
+    write_results(calibration, options.out, writers, {"session": str(options.session), "config": options.config})
+    return show_results(calibration, options.out, writers)
+
+
+def _refining(config: Config, option: str | None, no_sync: bool) -> tuple[Config, Any]:
+    """The configuration, and what to refine instead of what it says; None to do as it says.
+
+    Raises:
+        CalibrationError: for an unknown name, or if clocks are to be refined despite ``--no-sync``.
+    """
+    from torchstickcal.model.unknowns import REFINEMENTS, clock_refinements
+
+    refine: Any = option
+    if option is None:
+        refine = None if config.refine else "auto"
+    elif option != "auto":
+        refine = [] if option == "none" else option.split(",")
+        for name in refine:
+            REFINEMENTS[name]  # raises for an unknown name
+    if no_sync and refine is not None and clock_refinements() & set(refine):
+        raise CalibrationError(
+            "clocks cannot be refined if the cameras are synchronised",
+            where="--no-sync",
+            got=f"--refine {option}",
+            expected="one of the two",
+        )
+    return (replace(config, synchronise=False) if no_sync else config), refine
+
+
+def _with_stick(observations: Observations, length_m: float | None, sigma_m: float | None) -> Observations:
+    """The observations with another length of their stick, and another standard deviation of it.
+
+    Raises:
+        CalibrationError: if there is not exactly one stick, or if a value is not a length in metres.
+    """
+    if length_m is not None:
+        observations = observations.with_stick_length(length_m)
+    if sigma_m is None:
+        return observations
+    if len(observations.sticks) != 1:
+        raise CalibrationError(
+            "the standard deviation of a length needs a session with one stick",
+            where="--stick-sigma",
+            got=f"{len(observations.sticks)} sticks",
+            expected="one stick",
+        )
+    return replace(observations, sticks=(replace(observations.sticks[0], sigma_m=sigma_m),))
+
+
+def _monitor(log_dir: Path | None) -> Callback | None:
+    if log_dir is None:
+        return None
+    from torchstickcal.show.tensorboard import TensorBoardMonitor
+
+    return TensorBoardMonitor(log_dir)
+
+
+class Progress:
+    """Shows the iterations on the last line of a terminal, and passes all calls on to another callback."""
+
+    def __init__(self, following: Callback | None) -> None:
+        self._following = following
+        self._live = sys.stderr.isatty()
+
+    def on_iteration(self, record: IterationRecord) -> None:
+        if self._live:
+            line = f"{record.stage}: iteration {record.iteration}, cost {record.cost:.6g}"
+            print(f"\r{line:<70}", end="", file=sys.stderr, flush=True)
+        if self._following:
+            self._following.on_iteration(record)
+
+    def on_end(self, calibration: Calibration) -> None:
+        if self._live:
+            print(f"\r{'':<70}\r", end="", file=sys.stderr, flush=True)
+        if self._following:
+            self._following.on_end(calibration)

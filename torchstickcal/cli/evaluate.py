@@ -1,0 +1,59 @@
+"""The command `evaluate`."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from torchstickcal.cli.outputs import CAMERAS_FILE, EXIT_DONE, errors_by_camera, print_errors, write_json
+from torchstickcal.errors import CalibrationError
+
+if TYPE_CHECKING:
+    from torchstickcal.io import Truth
+
+
+def evaluate(options: argparse.Namespace) -> int:
+    """Cameras are matched by name if both sides have the same names, else by their order."""
+    from torchstickcal.io import Truth
+    from torchstickcal.metrics import pose_errors
+
+    names, estimate = _poses(options.calibration, None)
+    truth_names, truth = _poses(options.truth, options.format)
+    if len(names) != len(truth_names):
+        raise CalibrationError(
+            "the number of cameras differs",
+            where=str(options.truth),
+            got=f"{len(truth_names)} cameras",
+            expected=f"{len(names)} as in {options.calibration}",
+        )
+    if set(names) == set(truth_names):
+        order = [truth_names.index(name) for name in names]
+        truth = Truth(truth.rotations[order], truth.translations[order])
+    errors = pose_errors(estimate.rotations, estimate.translations, truth.rotations, truth.translations)
+    result = errors_by_camera(names, errors)
+    print_errors(result)
+    write_json(options.json, result)
+    return EXIT_DONE
+
+
+def _poses(path: Path, format: str | None) -> tuple[tuple[str, ...], Truth]:
+    """Names and poses of the cameras of a calibration, or of a session that holds its truth.
+
+    Args:
+        path: a file, or a folder that holds a camera file.
+        format: of the session; None if the content decides.
+    """
+    from torchstickcal.errors import FileFormatError
+    from torchstickcal.io import CALIBRATION_READERS, SESSION_READERS, Rig, Truth, find_reader
+
+    if format is None and (path / CAMERAS_FILE).is_file():
+        path = path / CAMERAS_FILE
+    reader = SESSION_READERS[format] if format else find_reader(path, CALIBRATION_READERS, SESSION_READERS)
+    content = reader.read(path)
+    if isinstance(content, Rig):
+        return content.names, Truth(content.rotations, content.translations)
+    observations, truth = content
+    if truth is None:
+        raise FileFormatError("a session without truth", where=str(path), got="no poses", expected="the poses of its cameras")
+    return observations.camera_labels, truth

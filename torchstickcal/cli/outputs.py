@@ -1,0 +1,87 @@
+"""What the commands write and show of a calibration and of its errors, and their exit statuses."""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from torchstickcal.errors import CalibrationError
+
+if TYPE_CHECKING:
+    from torchstickcal.io import Writer
+    from torchstickcal.metrics import PoseErrors
+    from torchstickcal.result import Calibration
+
+EXIT_DONE, EXIT_NOT_CONVERGED, EXIT_UNUSABLE = 0, 1, 2
+CAMERAS_FORMAT = "pose2sim"
+CAMERAS_FILE, POINTS_FILE, REPORT_FILE = "calibration.toml", "points.npz", "report.json"
+
+
+def chosen_writers(names: str | None) -> dict[str, Writer]:
+    """The writers of the camera file and of further formats, by the names of the files that they write.
+
+    Raises:
+        CalibrationError: for an unknown format, or if two files have the same name.
+    """
+    from torchstickcal.io import CALIBRATION_WRITERS
+
+    writers: dict[str, Writer] = {}
+    further = names.split(",") if names else []
+    for name in dict.fromkeys([CAMERAS_FORMAT, *further]):
+        writer = CALIBRATION_WRITERS[name]
+        if writer.file_name in {*writers, POINTS_FILE, REPORT_FILE}:
+            raise CalibrationError(
+                "two files of one name", where=f"--export {name}", got=writer.file_name, expected="another file name"
+            )
+        writers[writer.file_name] = writer
+    return writers
+
+
+def write_results(calibration: Calibration, folder: Path, writers: dict[str, Writer], provenance: dict[str, str]) -> None:
+    from torchstickcal.show.report import summary
+
+    folder.mkdir(parents=True, exist_ok=True)
+    for file_name, writer in writers.items():
+        writer.function(folder / file_name, calibration)
+    calibration.save(folder / POINTS_FILE)
+    write_json(folder / REPORT_FILE, provenance | summary(calibration))
+
+
+def show_results(calibration: Calibration, folder: Path, writers: dict[str, Writer]) -> int:
+    from torchstickcal.show.report import table
+
+    print(table(calibration))
+    print(f"\n{', '.join([*writers, POINTS_FILE, REPORT_FILE])} in {folder}")
+    if calibration.converged:
+        return EXIT_DONE
+    print(f"not converged: {calibration.status}", file=sys.stderr)
+    return EXIT_NOT_CONVERGED
+
+
+def errors_by_camera(names: Sequence[str], errors: PoseErrors) -> dict[str, Any]:
+    """The errors as a dictionary that can be written as JSON."""
+    rows = zip(names, errors.rotation_deg.tolist(), errors.translation_m.tolist(), strict=True)
+    return {
+        "mean_rotation_deg": errors.mean_rotation_deg,
+        "mean_translation_m": errors.mean_translation_m,
+        "cameras": [{"name": n, "rotation_deg": rotation, "translation_m": translation} for n, rotation, translation in rows],
+    }
+
+
+def print_errors(errors: dict[str, Any]) -> None:
+    width = max(6, *(len(camera["name"]) for camera in errors["cameras"]))
+    print(f"{'camera':{width}}  rotation (deg)  translation (mm)")
+    mean = {"name": "mean", "rotation_deg": errors["mean_rotation_deg"], "translation_m": errors["mean_translation_m"]}
+    for camera in [*errors["cameras"], mean]:
+        print(f"{camera['name']:{width}}  {camera['rotation_deg']:14.5f}  {1000 * camera['translation_m']:16.3f}")
+
+
+def write_json(path: Path | None, content: dict[str, Any]) -> None:
+    from torchstickcal.files import atomic_path
+
+    if path is not None:
+        with atomic_path(path) as temporary:
+            temporary.write_text(json.dumps(content, indent=2) + "\n", "utf-8")

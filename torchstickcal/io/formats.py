@@ -1,0 +1,353 @@
+"""File formats by name: readers of sessions, readers of calibrations, writers of calibrations.
+
+A new format is one decorated function, in a file of this folder or in a module of your own. :func:`read_session`,
+:func:`read_calibration`, :func:`write_calibration` and the command line then know it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Generic, TypeVar
+
+from torchstickcal.errors import CalibrationError, FileFormatError
+from torchstickcal.io.rig import Rig
+from torchstickcal.io.truth import Truth
+from torchstickcal.observations import Observations
+from torchstickcal.registry import Registry
+from torchstickcal.result import Calibration
+
+HEAD_BYTES = 4096
+"""Number of bytes from the beginning of a file that a recogniser is given."""
+
+Session = tuple[Observations, Truth | None]
+"""What a session reader returns: the observations, and the truth if the file holds it."""
+
+_Content = TypeVar("_Content")
+
+
+@dataclass(frozen=True)
+class Reader(Generic[_Content]):
+    """A file format that can be read.
+
+    Args:
+        function: reads a file or a folder.
+        recognises: whether a path is of this format, decided by its content. It is called with the path and with the first
+            :data:`HEAD_BYTES` bytes of the file (all of a shorter file, none of a folder).
+        description: the format in one line.
+    """
+
+    function: Callable[[Path], _Content]
+    recognises: Callable[[Path, bytes], bool]
+    description: str
+
+    def read(self, path: str | Path) -> _Content:
+        """The content of a file or a folder.
+
+        Raises:
+            FileFormatError: if it cannot be read.
+            ObservationError: if the session that it holds cannot be used for a calibration.
+            OSError: if it cannot be opened.
+        """
+        with reading(path, self.description):
+            return self.function(Path(path))
+
+
+@dataclass(frozen=True)
+class Writer:
+    """A file format that can be written.
+
+    Args:
+        function: writes a calibration to a path: its cameras, its points, or both.
+        file_name: name of the file that the command line writes.
+        description: the format in one line.
+    """
+
+    function: Callable[[Path, Calibration], None]
+    file_name: str
+    description: str
+
+
+SESSION_READERS: Registry[Reader[Session]] = Registry("session format", "torchstickcal.io")
+"""The formats of sessions that can be read, by name. :func:`session_reader` adds one."""
+
+CALIBRATION_READERS: Registry[Reader[Rig]] = Registry("calibration format", "torchstickcal.io")
+"""The formats of calibrations that can be read, by name. :func:`calibration_reader` adds one."""
+
+CALIBRATION_WRITERS: Registry[Writer] = Registry("output format", "torchstickcal.io")
+"""The formats in which a calibration can be written, by name. :func:`calibration_writer` adds one."""
+
+_SessionFunction = TypeVar("_SessionFunction", bound=Callable[[Path], Session])
+_RigFunction = TypeVar("_RigFunction", bound=Callable[[Path], Rig])
+_WriterFunction = TypeVar("_WriterFunction", bound=Callable[[Path, Calibration], None])
+
+
+def session_reader(
+    name: str, description: str, *, recognises: Callable[[Path, bytes], bool], replace: bool = False
+) -> Callable[[_SessionFunction], _SessionFunction]:
+    """A decorator that registers a function as the reader of a session format, and returns the function unchanged.
+
+    The function is called with a path and returns the :class:`~torchstickcal.Observations` and the :class:`Truth`, or None
+    where the file holds no truth. Any exception that it raises becomes a :class:`~torchstickcal.FileFormatError` that names
+    the file.
+
+    Args:
+        name: of the format.
+        description: the format in one line.
+        recognises: whether a path is of this format, as for :class:`Reader`.
+        replace: whether to replace a format of that name.
+
+    Raises:
+        ConfigError: if the name is in use.
+
+    Example::
+
+        import json
+
+        from torchstickcal import Observations, Stick
+        from torchstickcal.io import session_reader
+
+        @session_reader("toy", "keypoints (C, F, P, 2) as JSON", recognises=lambda path, head: head.startswith(b'{"toy"'))
+        def read_toy(path):
+            keypoints = json.loads(path.read_text())["toy"]
+            return Observations(keypoints, None, Stick(0, 1, length_m=1.2), image_size=(640, 480)), None
+    """
+
+    def register(function: _SessionFunction) -> _SessionFunction:
+        SESSION_READERS.register(name, Reader(function, recognises, description), replace=replace)
+        return function
+
+    return register
+
+
+def calibration_reader(
+    name: str, description: str, *, recognises: Callable[[Path, bytes], bool], replace: bool = False
+) -> Callable[[_RigFunction], _RigFunction]:
+    """A decorator that registers a function as the reader of a calibration format, and returns the function unchanged.
+
+    The function is called with a path and returns the :class:`Rig`. Any exception that it raises becomes a
+    :class:`~torchstickcal.FileFormatError` that names the file.
+
+    Args:
+        name: of the format.
+        description: the format in one line.
+        recognises: whether a path is of this format, as for :class:`Reader`.
+        replace: whether to replace a format of that name.
+
+    Raises:
+        ConfigError: if the name is in use.
+
+    Example::
+
+        import numpy as np
+        import torch
+        from torchstickcal.io import Rig, calibration_reader
+
+        @calibration_reader("toy", "camera matrices and poses as .npy", recognises=lambda path, head: b"NUMPY" in head[:6])
+        def read_toy(path):
+            matrices, rotations, translations = torch.from_numpy(np.load(path)).split([3, 3, 1], dim=2)  # (C, 3, 7)
+            count = len(matrices)
+            return Rig(
+                names=tuple(f"camera {number}" for number in range(count)),
+                intrinsics=matrices,
+                distortion=(torch.zeros(5, dtype=torch.float64),) * count,
+                fisheye=(False,) * count,
+                image_size=2 * matrices[:, :2, 2],
+                rotations=rotations,
+                translations=translations[..., 0],
+            )
+    """
+
+    def register(function: _RigFunction) -> _RigFunction:
+        CALIBRATION_READERS.register(name, Reader(function, recognises, description), replace=replace)
+        return function
+
+    return register
+
+
+def calibration_writer(
+    name: str, description: str, *, file_name: str, replace: bool = False
+) -> Callable[[_WriterFunction], _WriterFunction]:
+    """A decorator that registers a function as the writer of an output format, and returns the function unchanged.
+
+    The function is called with a path and a :class:`~torchstickcal.Calibration`, of which it writes the cameras, the points,
+    or both. It writes through :func:`torchstickcal.files.atomic_path`, so that an error leaves no incomplete file.
+
+    Args:
+        name: of the format.
+        description: the format in one line.
+        file_name: name of the file that the command line writes.
+        replace: whether to replace a format of that name.
+
+    Raises:
+        ConfigError: if the name is in use.
+
+    Example::
+
+        from torchstickcal.files import atomic_path
+        from torchstickcal.io import calibration_writer
+
+        @calibration_writer("toy", "names of the cameras, one per line", file_name="names.txt")
+        def write_toy(path, calibration):
+            with atomic_path(path) as temporary:
+                temporary.write_text("\\n".join(calibration.camera_names))
+    """
+
+    def register(function: _WriterFunction) -> _WriterFunction:
+        CALIBRATION_WRITERS.register(name, Writer(function, file_name, description), replace=replace)
+        return function
+
+    return register
+
+
+def read_session(path: str | Path, format: str | None = None) -> Session:
+    """Read a session: keypoints, intrinsics, sticks, and the truth if the file holds it.
+
+    Args:
+        path: of the file or the folder.
+        format: name of its format, a key of :data:`SESSION_READERS`; None to recognise it by its content.
+
+    Returns:
+        The observations, and the truth or None.
+
+    Raises:
+        FileFormatError: if no format is recognised, or if the file is damaged.
+        ConfigError: for an unknown format.
+        ObservationError: if the session cannot be used for a calibration.
+        OSError: if the file cannot be opened.
+
+    Example:
+        >>> import tempfile
+        >>> from torchstickcal.io import read_session, write_npz
+        >>> from torchstickcal.simulate import golf_session
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     write_npz(f"{folder}/swing.npz", *golf_session(cameras=3, frames=10))
+        ...     observations, truth = read_session(f"{folder}/swing.npz")
+        >>> observations.keypoints.shape, truth.rotations.shape
+        (torch.Size([3, 10, 21, 2]), torch.Size([3, 3, 3]))
+    """
+    reader: Reader[Session] = find_reader(path, SESSION_READERS) if format is None else SESSION_READERS[format]
+    return reader.read(path)
+
+
+def read_calibration(path: str | Path, format: str | None = None) -> Rig:
+    """Read the cameras of a calibration.
+
+    Args:
+        path: of the file or the folder.
+        format: name of its format, a key of :data:`CALIBRATION_READERS`; None to recognise it by its content.
+
+    Raises:
+        FileFormatError: if no format is recognised, or if the file is damaged.
+        ConfigError: for an unknown format.
+        OSError: if the file cannot be opened.
+
+    Example: see :func:`write_calibration`.
+    """
+    reader: Reader[Rig] = find_reader(path, CALIBRATION_READERS) if format is None else CALIBRATION_READERS[format]
+    return reader.read(path)
+
+
+def write_calibration(path: str | Path, calibration: Calibration, format: str) -> None:
+    """Write a calibration for another program.
+
+    :meth:`torchstickcal.Calibration.save` writes everything that a calibration holds, for
+    :meth:`torchstickcal.Calibration.load`.
+
+    Args:
+        path: of the file.
+        calibration: the calibration.
+        format: name of the format, a key of :data:`CALIBRATION_WRITERS`.
+
+    Raises:
+        ConfigError: for an unknown format.
+        OSError: if the file cannot be written.
+
+    Example:
+        >>> import tempfile
+        >>> from torchstickcal import calibrate
+        >>> from torchstickcal.io import read_calibration, write_calibration
+        >>> from torchstickcal.simulate import golf_session
+        >>> calibration = calibrate(golf_session(cameras=3, frames=10)[0])
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     write_calibration(f"{folder}/calibration.toml", calibration, "pose2sim")
+        ...     rig = read_calibration(f"{folder}/calibration.toml")
+        >>> rig.names, rig.translations.shape
+        (('cam01', 'cam02', 'cam03'), torch.Size([3, 3]))
+    """
+    CALIBRATION_WRITERS[format].function(Path(path), calibration)
+
+
+def find_reader(path: str | Path, *registries: Registry[Any]) -> Reader[Any]:
+    """The reader that recognises a file or a folder by its content.
+
+    Formats that were registered last are asked first: a format of your own may be a special case of a shipped one.
+
+    Args:
+        path: of the file or the folder.
+        registries: the readers that are asked: :data:`SESSION_READERS`, :data:`CALIBRATION_READERS`, or both.
+
+    Raises:
+        FileFormatError: if no reader recognises it; the message lists the known formats.
+        OSError: if it cannot be opened.
+
+    Example:
+        >>> import tempfile
+        >>> from torchstickcal.io import CALIBRATION_READERS, SESSION_READERS, find_reader, write_npz
+        >>> from torchstickcal.simulate import golf_session
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     write_npz(f"{folder}/swing.dat", *golf_session(cameras=3, frames=10))
+        ...     find_reader(f"{folder}/swing.dat", SESSION_READERS, CALIBRATION_READERS).function.__name__
+        'read_npz'
+    """
+    path = Path(path)
+    head = b"" if path.is_dir() else _head(path)
+    for registry in registries:
+        for reader in reversed(tuple(registry.values())):
+            if reader.recognises(path, head):
+                return reader
+    known = (f"{name} = {reader.description}" for registry in registries for name, reader in registry.items())
+    raise FileFormatError(
+        f"no {' or '.join(registry.kind for registry in registries)} is recognised",
+        where=str(path),
+        got="a folder" if path.is_dir() else f"a file that starts with {head[:16]!r}",
+        expected=f"one of: {'; '.join(known)}",
+        remedy="If it is one of these, give the name of the format.",
+    )
+
+
+@contextmanager
+def reading(path: str | Path, expected: str) -> Iterator[None]:
+    """A block in which a file is read: exceptions become FileFormatErrors that name the file.
+
+    Errors that are raised on purpose, and those of the operating system, are not changed.
+
+    Args:
+        path: of the file.
+        expected: what the file should hold.
+
+    Example:
+        >>> from torchstickcal import FileFormatError
+        >>> try:
+        ...     with reading("swing.json", "a length"):
+        ...         length_m = {}["length_m"]
+        ... except FileFormatError as error:
+        ...     print(error)
+        a file is damaged or not of the expected format (swing.json): got no 'length_m'; expected a length.
+    """
+    try:
+        yield
+    except (CalibrationError, OSError):
+        raise
+    except Exception as error:
+        got = f"no {error}" if isinstance(error, KeyError) else f"{type(error).__name__}: {error}"
+        raise FileFormatError(
+            "a file is damaged or not of the expected format", where=str(path), got=got, expected=expected
+        ) from error
+
+
+def _head(path: Path) -> bytes:
+    with path.open("rb") as file:
+        return file.read(HEAD_BYTES)
