@@ -150,7 +150,7 @@ class ReprojectionLoss(CameraPointLoss):
 @register_loss("reprojection")
 @dataclass(frozen=True)
 class ReprojectionSettings(LossSettings):
-    """The reprojection loss in a configuration.
+    """Keypoints against the projections of their points, in pixels.
 
     Args:
         sigma_px: noise of a keypoint along each axis, pixels; ``estimated`` takes it from the session, for each point.

@@ -44,7 +44,7 @@ class SmoothnessLoss(TrackLoss):
 @register_loss("smoothness")
 @dataclass(frozen=True)
 class SmoothnessSettings(LossSettings):
-    """The smoothness loss in a configuration.
+    """Acceleration of the points: their second differences over frames, in metres.
 
     Args:
         sigma_m: standard deviation of a second difference over frames, metres; ``estimated`` takes it from the session, for

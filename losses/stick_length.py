@@ -100,7 +100,7 @@ class StickLengthLoss(FrameLoss):
 @register_loss("stick_length")
 @dataclass(frozen=True)
 class StickLengthSettings(LossSettings):
-    """The stick-length loss in a configuration.
+    """Distance between the two ends of a stick against its length, in metres.
 
     Args:
         sigma_m: tolerance of the length, metres; ``stick`` takes each stick's own, :attr:`torchstickcal.Stick.sigma_m`.

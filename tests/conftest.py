@@ -3,16 +3,22 @@
 from __future__ import annotations
 
 import os
+import sys
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 import torch
 
-from torchstickcal.io import Truth
+from torchstickcal.benchmark import BASELINES
+from torchstickcal.io import CALIBRATION_READERS, CALIBRATION_WRITERS, SESSION_READERS, Truth
+from torchstickcal.losses import LOSSES
 from torchstickcal.model.measurements import Measurements
 from torchstickcal.model.state import State
+from torchstickcal.model.unknowns import REFINEMENTS
 from torchstickcal.observations import Observations
-from torchstickcal.simulate import Noise, golf_session
+from torchstickcal.registry import Registry
+from torchstickcal.simulate import SPORTS, Noise, golf_session
 
 _DATA = Path(os.environ.get("TORCHSTICKCAL_DATA", Path(__file__).parents[2] / "shared" / "data"))
 
@@ -23,6 +29,18 @@ def data() -> Path:
     if not _DATA.is_dir():
         pytest.skip(f"no recorded sessions at {_DATA}; set TORCHSTICKCAL_DATA to their folder")
     return _DATA
+
+
+@pytest.fixture
+def own_parts(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[tuple[Registry, ...]]:
+    """The registries; forget at the end of the test what it registered, and the modules that it wrote and imported."""
+    registries = (BASELINES, CALIBRATION_READERS, CALIBRATION_WRITERS, LOSSES, REFINEMENTS, SESSION_READERS, SPORTS)
+    for registry in registries:
+        monkeypatch.setattr(registry, "_things", dict(registry))
+    yield registries
+    for name, module in list(sys.modules.items()):
+        if str(getattr(module, "__file__", None)).startswith(str(tmp_path)):
+            del sys.modules[name]
 
 
 @pytest.fixture

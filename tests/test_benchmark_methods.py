@@ -6,8 +6,6 @@ import dataclasses
 import doctest
 import importlib
 import pkgutil
-import sys
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -46,15 +44,7 @@ ROW = Row(
 
 
 @pytest.fixture
-def own_baselines(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    """Forget at the end of the test the baselines that it registered."""
-    monkeypatch.setattr(BASELINES, "_things", dict(BASELINES))
-    yield
-    sys.modules.pop("my_baseline", None)
-
-
-@pytest.fixture
-def toy(own_baselines: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def toy(own_parts, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A baseline that a module of the user registers."""
     (tmp_path / "my_baseline.py").write_text(OWN)
     monkeypatch.syspath_prepend(tmp_path)
@@ -133,7 +123,7 @@ def test_a_baseline_of_one_s_own_runs_from_the_command_line(toy: None, tmp_path:
     assert "Did you mean 'toy'?" in capsys.readouterr().err
 
 
-def test_what_cannot_be_registered(own_baselines: None):
+def test_what_cannot_be_registered(own_parts):
     def estimate(inputs: Inputs) -> Estimate:
         raise NotImplementedError
 

@@ -10,7 +10,7 @@ import shutil
 import subprocess
 import sys
 import textwrap
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -31,7 +31,7 @@ from torchstickcal.io import (
 from torchstickcal.registry import Registry
 from torchstickcal.simulate import golf_session
 
-REGISTRIES = (SESSION_READERS, CALIBRATION_READERS, CALIBRATION_WRITERS)
+READERS = (SESSION_READERS, CALIBRATION_READERS)
 
 OWN = '''
 """Sessions as folders with one text file per camera; points as text."""
@@ -78,17 +78,7 @@ calibration_reader("aaa", "as pose2sim", recognises=lambda path, head: False)(re
 
 
 @pytest.fixture
-def own_formats(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    """Forget at the end of the test the formats that it registered."""
-    for registry in REGISTRIES:
-        monkeypatch.setattr(registry, "_things", dict(registry))
-    yield
-    for module in ("my_formats", "torchstickcal.io.wrapped"):
-        sys.modules.pop(module, None)
-
-
-@pytest.fixture
-def toy(own_formats: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+def toy(own_parts, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A session of a format that a module of the user registers."""
     (tmp_path / "my_formats.py").write_text(OWN)
     monkeypatch.syspath_prepend(tmp_path)
@@ -119,7 +109,7 @@ def test_each_shipped_format_is_recognised_by_its_content(shipped: dict[str, tup
     assert set(shipped) == {*SESSION_READERS, *CALIBRATION_READERS}
     for name, (registry, path) in shipped.items():
         head = path.read_bytes()[:4096]
-        readers = [(kind, other) for kind in REGISTRIES[:2] for other in kind if kind[other].recognises(path, head)]
+        readers = [(kind, other) for kind in READERS for other in kind if kind[other].recognises(path, head)]
         assert readers == [(registry, name)]
         assert find_reader(path, SESSION_READERS, CALIBRATION_READERS) is registry[name]
     observations, _ = read_session(shipped["npz"][1])
@@ -158,7 +148,7 @@ def test_a_reader_of_one_s_own_reads_a_folder(toy: Path):
     assert truth is None
 
 
-def test_a_reader_of_one_s_own_may_take_a_special_case_of_a_shipped_format(shipped, own_formats: None):
+def test_a_reader_of_one_s_own_may_take_a_special_case_of_a_shipped_format(shipped, own_parts):
     def read(path: Path) -> io.Session:
         observations, truth = io.read_npz(path)
         return observations.with_stick_length(2.0), truth
@@ -187,10 +177,10 @@ def test_a_writer_of_one_s_own_writes(toy: Path, tmp_path: Path):
     assert json.loads(lines[0]) == calibration.points[0, 0].tolist()
 
 
-def test_a_new_file_in_the_folder_is_found(own_formats: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+def test_a_new_file_in_the_folder_is_found(own_parts, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     (tmp_path / "wrapped.py").write_text(FILE)
     monkeypatch.setattr(io, "__path__", [*io.__path__, str(tmp_path)])
-    for registry in REGISTRIES:
+    for registry in (*READERS, CALIBRATION_WRITERS):
         monkeypatch.setattr(registry, "_imported", False)
     (tmp_path / "a.txt").write_text("WRAP")
     with pytest.raises(FileFormatError, match=r"a\.txt.*RuntimeError: no idea; expected a calibration.toml behind a line"):
@@ -215,7 +205,7 @@ def test_a_new_file_may_build_on_shipped_formats(tmp_path: Path):
         assert "aaa" in run.stdout, run.stderr
 
 
-def test_a_name_is_registered_once(own_formats: None):
+def test_a_name_is_registered_once(own_parts):
     def write(path: Path, calibration: object) -> None:
         raise NotImplementedError
 
@@ -231,7 +221,7 @@ def example(decorator: Callable) -> None:
     exec(textwrap.dedent(decorator.__doc__.partition("Example::")[2]), {})
 
 
-def test_the_examples_of_the_decorators(own_formats: None, tmp_path: Path):
+def test_the_examples_of_the_decorators(own_parts, tmp_path: Path):
     for decorator in (io.session_reader, io.calibration_reader, io.calibration_writer):
         example(decorator)
     (tmp_path / "a").write_text('{"toy": [[[[10, 20], [30, 40]]], [[[50, 60], [70, 80]]]]}')

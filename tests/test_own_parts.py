@@ -12,7 +12,6 @@ from torch import Tensor
 
 from torchstickcal import Calibration, CalibrationLayer, ConfigError, Intrinsics, TensorBoardMonitor, calibrate, load_config
 from torchstickcal.losses import (
-    LOSSES,
     CameraPointLoss,
     Cauchy,
     FrameLoss,
@@ -28,7 +27,7 @@ from torchstickcal.losses import (
 from torchstickcal.model.measurements import Measurements
 from torchstickcal.model.objective import Objective
 from torchstickcal.model.state import State
-from torchstickcal.model.unknowns import REFINEMENTS, LensUnknown, Sharing, View, all_unknowns, register_unknown
+from torchstickcal.model.unknowns import LensUnknown, Sharing, View, all_unknowns, register_unknown
 from torchstickcal.show.report import summary, table
 from torchstickcal.simulate import Noise, SessionSpec, golf_session
 from torchstickcal.simulate.regimes import GaussianNoise
@@ -123,11 +122,8 @@ class Aspect(LensUnknown):
 
 
 @pytest.fixture
-def own_parts(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The parts above, registered as a user's module would, and forgotten afterwards."""
-    for registry in (LOSSES, REFINEMENTS):
-        known = dict(registry.items())
-        monkeypatch.setattr(registry, "_things", known)
+def registered(own_parts) -> None:
+    """The parts above, registered as a user's module would."""
     register_loss("equal_forearms")(EqualForearms)
     register_loss("rays")(RaySettings)
     register_loss("slow")(SlowSettings)
@@ -149,7 +145,7 @@ def forearm_difference_m(calibration: Calibration) -> float:
     return float((left - right).abs().nanmedian())
 
 
-@pytest.mark.usefixtures("own_parts")
+@pytest.mark.usefixtures("registered")
 class TestLoss:
     """Left and right forearm of equal length: a loss of four points of a frame, two of which a stick may share."""
 
@@ -289,7 +285,7 @@ def test_closed_forms_are_the_automatic_ones(disturbed: tuple[Measurements, Stat
     torch.testing.assert_close(length.slope(*along), FrameLoss.slope(length, *along), rtol=1e-11, atol=0)
 
 
-@pytest.mark.usefixtures("own_parts")
+@pytest.mark.usefixtures("registered")
 class TestCameraUnknown:
     """The aspect ratio of pixels, 1 % off in every camera."""
 

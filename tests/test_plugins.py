@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 import json
-import sys
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
-from torchstickcal.benchmark import BASELINES, METHODS
+from torchstickcal.benchmark import METHODS
 from torchstickcal.benchmark.run import CONVERGED, read_rows
 from torchstickcal.cli import main
 from torchstickcal.config import config_names
@@ -18,7 +16,7 @@ from torchstickcal.losses import LOSSES
 from torchstickcal.model.unknowns import REFINEMENTS
 from torchstickcal.simulate import PRESETS, SPORTS, golf_session
 
-REGISTRIES = (BASELINES, CALIBRATION_READERS, CALIBRATION_WRITERS, LOSSES, REFINEMENTS, SESSION_READERS, SPORTS)
+pytestmark = pytest.mark.usefixtures("own_parts")
 
 OWN = '''
 """One thing of each kind."""
@@ -98,16 +96,6 @@ def toy_method(inputs):
     """The stick alone. It is a toy."""
     return Estimate.of_calibration(calibrate(inputs.observations, "stick_only"))
 '''
-
-
-@pytest.fixture(autouse=True)
-def own_things(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    """Forget at the end of the test what it registered."""
-    for registry in REGISTRIES:
-        monkeypatch.setattr(registry, "_things", dict(registry))
-    yield
-    for module in ("my_things", "torchstickcal_plugin_my_things"):
-        sys.modules.pop(module, None)
 
 
 @pytest.fixture

@@ -6,8 +6,6 @@ import doctest
 import hashlib
 import importlib
 import pkgutil
-import sys
-from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -64,17 +62,7 @@ def fingerprint(name: str) -> str:
 
 
 @pytest.fixture
-def own_sports(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    """Forget at the end of the test the sports that it registered."""
-    shipped = dict(SPORTS)
-    monkeypatch.setattr(SPORTS, "_things", dict(shipped))
-    yield
-    for module in ("my_tennis", "torchstickcal.simulate.motions.badminton"):
-        sys.modules.pop(module, None)
-
-
-@pytest.fixture
-def tennis(own_sports: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def tennis(own_parts, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Tennis, registered by a module of the user."""
     (tmp_path / "my_tennis.py").write_text(TENNIS.replace("NAME", "tennis"))
     monkeypatch.syspath_prepend(tmp_path)
@@ -99,7 +87,7 @@ def test_a_sport_of_one_s_own_is_measured(tennis: None, tmp_path: Path):
     assert case.regime == "windy"
 
 
-def test_a_new_file_in_the_folder_is_found(own_sports: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+def test_a_new_file_in_the_folder_is_found(own_parts, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     (tmp_path / "badminton.py").write_text(TENNIS.replace("NAME", "badminton"))
     monkeypatch.setattr(motions, "__path__", [*motions.__path__, str(tmp_path)])
     monkeypatch.setattr(SPORTS, "_imported", False)
@@ -121,7 +109,7 @@ def test_a_new_sport_changes_no_preset(tennis: None):
     assert not any(spec.sport == "tennis" for name in PRESETS for spec in preset(name))
 
 
-def test_a_new_sport_changes_no_regime(own_sports: None):
+def test_a_new_sport_changes_no_regime(own_parts):
     """Names of layouts, paths and regimes may be names of sports too."""
     case = sources("hard", 3)[2].load()
     assert case is not None

@@ -25,7 +25,7 @@ _SIGMA_M = 0.001
 
 @baseline("ewand", Listing("eWand", {"sota": None}, position=24))
 def ewand(inputs: Inputs) -> Estimate:
-    """The stick as a wand.
+    """Relative poses of pairs of cameras from the ends of the stick, then bundle adjustment with its length.
 
     The residual of straightness is used only if the session has a third point on its stick, named ``stick_middle``.
 

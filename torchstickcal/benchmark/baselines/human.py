@@ -56,7 +56,9 @@ def human_guessed_high(inputs: Inputs) -> Estimate:
     needs=("bone_lengths_m",),
 )
 def human_bones(inputs: Inputs) -> Estimate:
-    """Scale from true bone lengths L: ``s = sum L l / sum l^2`` with the mean reconstructed lengths l of the bones.
+    """Scale from true bone lengths.
+
+    It is ``s = sum L l / sum l^2`` with true lengths L and mean reconstructed lengths l of the bones.
 
     Args:
         inputs: needs ``bone_lengths_m``.

@@ -203,7 +203,7 @@ class Refinement(NamedTuple):
     sharing: Sharing
 
 
-REFINEMENTS = Registry[Refinement]("camera unknown", "torchstickcal.model.unknowns")
+REFINEMENTS = Registry[Refinement]("camera parameter", "torchstickcal.model.unknowns")
 """What may be refined, by the names that configurations use."""
 
 
