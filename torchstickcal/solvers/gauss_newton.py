@@ -156,6 +156,7 @@ class _SessionControl:
             self._raise_damping(self._trial_damping)
 
     def _raise_damping(self, damping: float) -> None:
+        """Set the damping to ten times a value that was too small, or stop if it becomes too large."""
         self._rejected, self._factor = True, _KEEP
         self.damping = max(damping, 1e-8) * 10
         if self.damping > _MAX_DAMPING:

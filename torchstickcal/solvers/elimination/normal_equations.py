@@ -145,8 +145,7 @@ class NormalEquations:
         self._unknowns = m.unknowns if cameras_free else RigUnknowns.of((), m.cameras)
         self._damping = torch.as_tensor(damping, dtype=torch.float64, device=state.points.device).expand(m.sessions)
         self.terms = {name: state.points.new_zeros(m.sessions) for name in objective.losses}
-        self._couplings = self._add_point_losses()
-        self._parts = parts(m, objective.clusters, self._couplings)
+        self._parts = parts(m, objective.clusters, self._add_point_losses())
         self._cache: list[_EliminatedPart] | None = None
         self._add_camera_point_losses()
 
