@@ -1,4 +1,4 @@
-"""Eliminations against dense linear algebra."""
+"""The eliminations agree with dense linear algebra."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def entries(blocks: Tensor) -> Tensor:
 
 
 def system(frames: int, clusters: list[tuple[int, ...]], smooth: bool) -> tuple[Tensor, Tensor, Couplings]:
-    """Dense matrix (ordered frame, point, axis), the points' own blocks, and the blocks between different points."""
+    """Dense Hessian in the order frame, point, axis; its diagonal blocks; and its blocks off the diagonal."""
     generator = torch.Generator().manual_seed(frames)
 
     def random(*shape: int) -> Tensor:
@@ -71,7 +71,7 @@ def flat(columns: Tensor) -> Tensor:
 
 
 def check(found: list[Part], hessian: Tensor, dense: Tensor) -> None:
-    """Parts that together hold all columns against dense algebra, for random blocks N_c of two cameras and a gradient."""
+    """Compare the parts with dense linear algebra, for random blocks N_c of two cameras and a random gradient."""
     count = hessian.shape[1]
     generator = torch.Generator().manual_seed(count)
     shapes = ((1, 2, 6, count), (1, 3, count), (1, 3, count))
@@ -83,8 +83,8 @@ def check(found: list[Part], hessian: Tensor, dense: Tensor) -> None:
     for part in found:
         columns = part.columns
         elimination = part.eliminate(hessian[None, :, columns])
-        rows, half = elimination.reductions(cross[..., columns], points[..., columns], gradient[..., columns])
-        both = torch.cat([rows, half[:, None]], dim=1)[0]
+        rows, solved = elimination.forward_solve_cross(cross[..., columns], points[..., columns], gradient[..., columns])
+        both = torch.cat([rows, solved[:, None]], dim=1)[0]
         reduced += both @ both.mT
         solution[..., columns] = elimination.solve(gradient[..., columns])
     torch.testing.assert_close(reduced, expected, rtol=1e-10, atol=1e-10 * float(expected.abs().max()))
@@ -92,15 +92,15 @@ def check(found: list[Part], hessian: Tensor, dense: Tensor) -> None:
 
 
 def session(frames: int) -> Measurements:
-    """Nothing but the shape of a session of one camera."""
+    """A session of one camera of which only the shape matters."""
     cameras = Intrinsics(torch.eye(3, dtype=torch.float64)[None, None])
     pixels, confidence = torch.zeros(1, 1, 2, frames * P, dtype=torch.float64), torch.ones(1, 1, frames * P)
-    nothing = torch.zeros(0)
+    empty = torch.zeros(0)
     unknowns = RigUnknowns.of((), cameras)
-    return Measurements(pixels, confidence, cameras, frames, torch.zeros(0, 2).long(), nothing[None], nothing, unknowns)
+    return Measurements(pixels, confidence, cameras, frames, torch.zeros(0, 2).long(), empty[None], empty, unknowns)
 
 
-def test_cross_rows_are_blocks_times_the_cameras_jacobian():
+def test_cross_rows_are_blocks_times_camera_jacobians():
     blocks, points = torch.randn(2, 6, 7, dtype=torch.float64), torch.randn(3, 7, dtype=torch.float64)
     matrices = expand(blocks).movedim(-1, 1)
     jacobian = torch.cat([torch.eye(3, dtype=torch.float64).expand(7, 3, 3), -se3.hat(points.mT)], dim=-1)
@@ -114,7 +114,9 @@ def test_cross_rows_are_blocks_times_the_cameras_jacobian():
 @pytest.mark.parametrize("clusters", CLUSTERS.values(), ids=CLUSTERS.keys())
 @pytest.mark.parametrize("frames", [1, 2, 3, 7])
 @pytest.mark.parametrize("chunk", [6, 32_000])
-def test_points_of_one_frame(frames: int, clusters: list[tuple[int, ...]], chunk: int, monkeypatch: pytest.MonkeyPatch):
+def test_elimination_of_points_of_one_frame(
+    frames: int, clusters: list[tuple[int, ...]], chunk: int, monkeypatch: pytest.MonkeyPatch
+):
     monkeypatch.setattr("torchstickcal.model.measurements._CHUNK_KEYPOINTS", {"cpu": chunk})
     dense, blocks, couplings = system(frames, clusters, smooth=False)
     check(parts(session(frames), clusters, couplings), blocks, dense)
@@ -123,8 +125,8 @@ def test_points_of_one_frame(frames: int, clusters: list[tuple[int, ...]], chunk
 @pytest.mark.parametrize("clusters", CLUSTERS.values(), ids=CLUSTERS.keys())
 @pytest.mark.parametrize("frames", [3, 4, 5, 8, 11])
 @pytest.mark.parametrize("together", [1, 1000])
-def test_tracks(frames: int, clusters: list[tuple[int, ...]], together: int, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr("torchstickcal.solvers.elimination.parts._TRACK_POINTS", together)
+def test_elimination_of_tracks(frames: int, clusters: list[tuple[int, ...]], together: int, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr("torchstickcal.solvers.elimination.parts._MAX_TRACK_POINTS", together)
     dense, blocks, couplings = system(frames, clusters, smooth=True)
     found = parts(session(frames), clusters, couplings)
     columns = torch.cat([torch.arange(frames * P)[part.columns] for part in found])
@@ -132,7 +134,7 @@ def test_tracks(frames: int, clusters: list[tuple[int, ...]], together: int, mon
     check(found, blocks, dense)
 
 
-def test_mean_variance_of_a_point():
+def test_inverse_diagonal():
     _, blocks, _ = system(4, [], smooth=False)
     matrices = expand(blocks).movedim(-1, 0)
     torch.testing.assert_close(inverse_diagonal(blocks).mT, torch.linalg.inv(matrices).diagonal(dim1=1, dim2=2))
@@ -155,4 +157,4 @@ def test_block_tridiagonal(count: int):
     solver = BlockTridiagonal(diagonal, torch.stack(under, dim=1) if under else diagonal.new_zeros(2, 0, 4, 4))
     right = torch.randn(2, count, 4, 3, dtype=torch.float64)
     expected = torch.linalg.solve(factor @ factor.mT, right.reshape(2, -1, 3)).reshape(right.shape)
-    torch.testing.assert_close(solver.back_solve(solver.half_solve(right)), expected, rtol=1e-9, atol=1e-10)
+    torch.testing.assert_close(solver.backward_solve(solver.forward_solve(right)), expected, rtol=1e-9, atol=1e-10)

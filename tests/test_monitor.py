@@ -1,16 +1,18 @@
-"""What TensorBoard gets to see."""
+"""The content of the TensorBoard log."""
 
 from __future__ import annotations
 
+import doctest
 from pathlib import Path
 
 import pytest
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from torchstickcal import TensorBoardMonitor, calibrate
+from torchstickcal.show import tensorboard
 
 
-def test_log_holds_every_iteration_of_every_stage(tmp_path: Path, noisy):
+def test_log_has_every_iteration_of_every_stage(tmp_path: Path, noisy):
     calibration = calibrate(noisy[0], callback=TensorBoardMonitor(tmp_path))
     log = EventAccumulator(str(tmp_path))
     log.Reload()
@@ -30,3 +32,7 @@ def test_log_holds_every_iteration_of_every_stage(tmp_path: Path, noisy):
     assert "4 trajectories/loss/smoothness" in tags["scalars"]
     assert tags["images"] == ["rig"]
     assert tags["tensors"] == ["summary/text_summary"]
+
+
+def test_example_of_the_monitor_runs():
+    assert doctest.testmod(tensorboard).failed == 0

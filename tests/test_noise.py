@@ -1,4 +1,4 @@
-"""Noise estimated from the data."""
+"""Estimates of the keypoint noise and of the acceleration."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ def test_sigma_is_that_of_the_inliers(cameras: int, outliers: float):
     assert sigma.mean().item() == pytest.approx(1.5, rel=0.12 if outliers else 0.05)
 
 
-def test_points_of_different_noise_are_told_apart_and_alike_ones_are_treated_alike():
+def test_points_get_different_sigmas_only_if_their_noise_differs():
     observations, truth = golf_session(cameras=5, frames=150)
     generator = torch.Generator().manual_seed(1)
     sigma = torch.ones(21, dtype=torch.float64)
@@ -34,8 +34,8 @@ def test_points_of_different_noise_are_told_apart_and_alike_ones_are_treated_ali
         state = State.of(truth.rotations[None], truth.translations[None], points[None])
         return estimate_sigma_px(measurements, measurements.squared_residuals(state))[0]
 
-    alike = estimated(sigma)
-    assert alike.max() / alike.min() < 1.02
+    equal = estimated(sigma)
+    assert equal.max() / equal.min() < 1.02
     sigma[10:] = 4.0
     different = estimated(sigma)
     torch.testing.assert_close(different / different[0], sigma, rtol=0.1, atol=0)

@@ -1,4 +1,4 @@
-"""The reduced system against a dense solve of the full normal equations, built by autograd."""
+"""The reduced camera system agrees with a dense solve of the full normal equations, which autograd builds."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ LOSSES: dict[str, dict[str, Loss]] = {
 
 
 def dense_system(objective: Objective, state: State) -> tuple[torch.Tensor, torch.Tensor, float]:
-    """Hessian and gradient of the weighted residuals by all unknowns (cameras but the first, then points), and the cost."""
+    """Hessian and gradient with respect to all unknowns (all cameras but the first, then points), and the cost."""
     m = objective.measurements
     shape = (m.frames, m.points_per_frame, 3)
     start_rotations, start_translations, start_points = state.rotations[0], state.translations[0], state.points[0].mT
@@ -78,14 +78,14 @@ def dense_system(objective: Objective, state: State) -> tuple[torch.Tensor, torc
 
 @pytest.mark.parametrize("losses", LOSSES.values(), ids=LOSSES.keys())
 @pytest.mark.parametrize("damping", [0.0, 1e-3])
-def test_step_is_that_of_the_full_system(disturbed: tuple[Measurements, State], losses: dict[str, Loss], damping: float):
+def test_step_agrees_with_the_full_system(disturbed: tuple[Measurements, State], losses: dict[str, Loss], damping: float):
     measurements, state = first_frames(*disturbed, frames=6)
     objective = Objective(measurements, losses)
     hessian, gradient, cost = dense_system(objective, state)
     inactive = (~measurements.active[0]).repeat_interleave(3).nonzero().flatten() + 18
     hessian[inactive, inactive] += 1.0
     if "length" not in losses:
-        damping = max(damping, 1e-6)  # the scale is open without a length
+        damping = max(damping, 1e-6)  # nothing determines the scale without a length
     damped = hessian + damping * torch.diag(hessian.diagonal())
 
     system = NormalEquations(objective, state, True, damping)
@@ -125,8 +125,8 @@ EXACT: dict[str, dict[str, Loss]] = {
 
 
 @pytest.mark.parametrize("losses", EXACT.values(), ids=EXACT.keys())
-def test_exact_hessian_is_autograds(disturbed: tuple[Measurements, State], losses: dict[str, Loss]):
-    """At a state that is no minimum, with distorted lenses: all terms of the second derivative take part."""
+def test_exact_hessian_agrees_with_autograd(disturbed: tuple[Measurements, State], losses: dict[str, Loss]):
+    """At a state that is not a minimum, where every term of the second derivative is nonzero."""
     measurements, state = first_frames(*disturbed, frames=5)
     objective = Objective(measurements, losses)
 
@@ -150,7 +150,7 @@ def test_exact_hessian_is_autograds(disturbed: tuple[Measurements, State], losse
         cameras, _, points, _ = system.solve(rhs[:18].view(1, 3, 6), none, rhs[18:].view(1, -1, 3).mT)
         return torch.cat([cameras.flatten(), points[0].mT.flatten()])
 
-    damping = 0.5  # makes it definite away from the minimum
+    damping = 0.5  # makes the Hessian positive definite away from the minimum
     damped = hessian + damping * torch.diag(hessian.diagonal())
     torch.testing.assert_close(damped @ solved(damping), rhs, rtol=1e-8, atol=1e-8)
 
@@ -162,7 +162,7 @@ def test_exact_hessian_is_autograds(disturbed: tuple[Measurements, State], losse
 
 
 @pytest.mark.parametrize("losses", LOSSES.values(), ids=LOSSES.keys())
-def test_linearised_cost_and_gradient_are_autograds(disturbed: tuple[Measurements, State], losses: dict[str, Loss]):
+def test_linearised_cost_and_gradient_agree_with_autograd(disturbed: tuple[Measurements, State], losses: dict[str, Loss]):
     measurements, state = disturbed
     objective = Objective(measurements, losses)
     points = state.points.clone().requires_grad_()
@@ -175,17 +175,17 @@ def test_linearised_cost_and_gradient_are_autograds(disturbed: tuple[Measurement
 
 
 @pytest.mark.parametrize("losses", LOSSES.values(), ids=LOSSES.keys())
-@pytest.mark.parametrize("kept", [True, False], ids=["kept", "computed again"])
-def test_parts_add_up(
-    disturbed: tuple[Measurements, State], losses: dict[str, Loss], kept: bool, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize("cached", [True, False], ids=["cached", "computed again"])
+def test_splitting_into_parts_does_not_change_the_step(
+    disturbed: tuple[Measurements, State], losses: dict[str, Loss], cached: bool, monkeypatch: pytest.MonkeyPatch
 ):
     measurements, state = disturbed
     objective = Objective(measurements, losses)
     whole = NormalEquations(objective, state, True, 1e-3).step()
     monkeypatch.setattr("torchstickcal.model.measurements._CHUNK_KEYPOINTS", {"cpu": 200})
-    monkeypatch.setattr("torchstickcal.solvers.elimination.parts._TRACK_POINTS", 90)
-    if not kept:
-        monkeypatch.setattr("torchstickcal.solvers.elimination.normal_equations._KEPT_BYTES", 0)
+    monkeypatch.setattr("torchstickcal.solvers.elimination.parts._MAX_TRACK_POINTS", 90)
+    if not cached:
+        monkeypatch.setattr("torchstickcal.solvers.elimination.normal_equations._MAX_CACHED_BYTES", 0)
     assert len(measurements.chunks()) > 10
     parts = NormalEquations(objective, state, True, 1e-3).step()
     torch.testing.assert_close(parts.cameras, whole.cameras, rtol=1e-9, atol=1e-12)
@@ -193,7 +193,7 @@ def test_parts_add_up(
 
 
 @pytest.mark.parametrize("losses", LOSSES.values(), ids=LOSSES.keys())
-def test_sessions_of_a_batch_do_not_mix(disturbed: tuple[Measurements, State], losses: dict[str, Loss]):
+def test_sessions_of_a_batch_are_independent(disturbed: tuple[Measurements, State], losses: dict[str, Loss]):
     measurements, state = disturbed
     generator = torch.Generator().manual_seed(5)
     shift = 0.01 * torch.randn(state.points.shape, generator=generator, dtype=torch.float64)

@@ -1,6 +1,8 @@
-"""The two solvers: the same minimum, honest reasons for stopping, never a worse state."""
+"""Both solvers: they find the same minimum, report why they stopped, and never return a worse state."""
 
 from __future__ import annotations
+
+import doctest
 
 import pytest
 import torch
@@ -9,7 +11,7 @@ from torchstickcal.losses import Cauchy, GemanMcClure, Loss, ReprojectionLoss, S
 from torchstickcal.model.measurements import Measurements
 from torchstickcal.model.objective import Objective
 from torchstickcal.model.state import State
-from torchstickcal.solvers import IterationRecord, Stop, Termination, solver
+from torchstickcal.solvers import IterationRecord, Stop, Termination, gradients, solver
 
 LOSSES: dict[str, dict[str, Loss]] = {
     "whitened": {"reprojection": ReprojectionLoss(1.0, kernel=GemanMcClure(8.0)), "length": StickLengthLoss(0.001)},
@@ -23,16 +25,16 @@ TIGHT = Termination(max_iterations=200, cost_tolerance=1e-11, camera_tolerance=1
 
 
 def run(name: str, objective: Objective, state: State, termination: Termination = TIGHT, cameras_free: bool = True):
-    heard: list[IterationRecord] = []
+    records: list[IterationRecord] = []
     outcome = solver(name)(
-        objective, state, cameras_free=cameras_free, termination=termination, stage="test", listener=heard.append
+        objective, state, cameras_free=cameras_free, termination=termination, stage="test", listener=records.append
     )
-    assert (tuple(heard),) == outcome.iterations
+    assert (tuple(records),) == outcome.iterations
     return outcome
 
 
 @pytest.mark.parametrize("losses", LOSSES.values(), ids=LOSSES.keys())
-def test_both_reach_the_same_minimum(disturbed: tuple[Measurements, State], losses: dict[str, Loss]):
+def test_both_solvers_find_the_same_minimum(disturbed: tuple[Measurements, State], losses: dict[str, Loss]):
     measurements, state = disturbed
     objective = Objective(measurements, losses)
     ours, theirs = run("gauss_newton", objective, state), run("lbfgs", objective, state)
@@ -43,7 +45,7 @@ def test_both_reach_the_same_minimum(disturbed: tuple[Measurements, State], loss
 
 
 @pytest.mark.parametrize("name", ["gauss_newton", "lbfgs"])
-def test_gradient_vanishes_at_the_end(disturbed: tuple[Measurements, State], name: str):
+def test_gradient_is_zero_at_the_result(disturbed: tuple[Measurements, State], name: str):
     measurements, state = disturbed
     objective = Objective(measurements, LOSSES["whitened"])
 
@@ -58,7 +60,7 @@ def test_gradient_vanishes_at_the_end(disturbed: tuple[Measurements, State], nam
 
 
 @pytest.mark.parametrize("name", ["gauss_newton", "lbfgs"])
-def test_held_cameras_stay(disturbed: tuple[Measurements, State], name: str):
+def test_cameras_held_fixed_do_not_change(disturbed: tuple[Measurements, State], name: str):
     measurements, state = disturbed
     outcome = run(name, Objective(measurements, LOSSES["whitened"]), state, cameras_free=False)
     assert outcome.stops[0].converged
@@ -67,7 +69,7 @@ def test_held_cameras_stay(disturbed: tuple[Measurements, State], name: str):
     assert outcome.iterations[0][-1].cost < outcome.iterations[0][0].cost
 
 
-def test_cost_never_rises_and_terms_add_up(disturbed: tuple[Measurements, State]):
+def test_cost_never_increases_and_is_the_sum_of_its_terms(disturbed: tuple[Measurements, State]):
     measurements, state = disturbed
     records = run("gauss_newton", Objective(measurements, LOSSES["paper"]), state).iterations[0]
     costs = [record.cost for record in records]
@@ -78,7 +80,7 @@ def test_cost_never_rises_and_terms_add_up(disturbed: tuple[Measurements, State]
 
 
 @pytest.mark.parametrize("name", ["gauss_newton", "lbfgs"])
-def test_limit_of_iterations_is_reported(disturbed: tuple[Measurements, State], name: str):
+def test_stop_at_the_limit_of_iterations_is_reported(disturbed: tuple[Measurements, State], name: str):
     measurements, state = disturbed
     outcome = run(name, Objective(measurements, LOSSES["whitened"]), state, Termination(max_iterations=1, cost_tolerance=1e-15))
     assert outcome.stops == (Stop.ITERATIONS,)
@@ -86,9 +88,13 @@ def test_limit_of_iterations_is_reported(disturbed: tuple[Measurements, State], 
     assert [record.iteration for record in outcome.iterations[0]] == [0, 1]
 
 
-def test_a_hopeless_start_gives_a_status_and_the_state_it_had(disturbed: tuple[Measurements, State]):
+def test_an_invalid_start_gives_a_status_and_returns_its_state(disturbed: tuple[Measurements, State]):
     measurements, state = disturbed
     broken = State.of(state.rotations, state.translations, torch.full_like(state.points, torch.nan))
     outcome = run("gauss_newton", Objective(measurements, LOSSES["whitened"]), broken)
     assert outcome.stops == (Stop.DIVERGED,)
     assert torch.equal(outcome.state.translations, state.translations)
+
+
+def test_examples_of_the_gradient_modes_run():
+    assert doctest.testmod(gradients).failed == 0

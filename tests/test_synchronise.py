@@ -1,4 +1,4 @@
-"""Clock offsets from the motion, and sessions moved onto a common frame axis."""
+"""Time offsets from the motion in the images, and sessions on common frames."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ SPEC = SessionSpec("clocks", "golf", 7, 4, 150, 30.0, "ring", regimes=HARD, cloc
     ],
     ids=["golf", "far", "rolling", "focal", "gaps", "rates"],
 )
-def test_offsets_come_back_to_a_fraction_of_a_frame(spec: SessionSpec):
+def test_offsets_are_found_to_a_fraction_of_a_frame(spec: SessionSpec):
     session = spec.generate()
     truth = session.truth.time_offsets_s * spec.fps
     found = search_offsets(Measurements.of(session.observations), spec.clocks.offset_s * spec.fps)
@@ -41,13 +41,13 @@ def test_offsets_come_back_to_a_fraction_of_a_frame(spec: SessionSpec):
     assert (found.offsets_frames - truth).abs().max() < 0.5
 
 
-def test_cameras_in_step_are_found_in_step():
+def test_synchronised_cameras_have_no_offsets():
     session = replace(SPEC, clocks=Clocks()).generate()
     found = search_offsets(Measurements.of(session.observations), 30)
     assert found.offsets_frames.abs().max() < 0.2
 
 
-def test_a_body_at_rest_tells_nothing():
+def test_offsets_without_motion_are_undetermined():
     session = replace(SPEC, regimes=(), clocks=Clocks()).generate()
     still = session.observations.keypoints[:, :1].expand(-1, 150, -1, -1)
     noise = torch.randn(still.shape, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
@@ -57,7 +57,7 @@ def test_a_body_at_rest_tells_nothing():
     assert (found.offsets_frames == 0).all()
 
 
-def test_a_motion_that_repeats_itself_has_no_single_offset():
+def test_offsets_of_a_periodic_motion_are_undetermined():
     session = replace(SPEC, frames=25, regimes=(), clocks=Clocks()).generate()
     period = session.observations.keypoints
     there_and_back = torch.cat([period, period.flip(1)], dim=1)
@@ -66,67 +66,67 @@ def test_a_motion_that_repeats_itself_has_no_single_offset():
     assert (found.offsets_frames == 0).all()
 
 
-def test_a_camera_that_saw_nothing_is_left_out():
+def test_a_camera_without_keypoints_is_undetermined():
     session = SPEC.generate()
     keypoints = session.observations.keypoints.clone()
     keypoints[2] = torch.nan
     found = search_offsets(Measurements.of(replace(session.observations, keypoints=keypoints)), 30)
     assert found.determined == (True, True, False, True)
-    assert "too few points" in found.reasons[2]
+    assert "too few common points" in found.reasons[2]
     assert (found.offsets_frames - SPEC.fps * session.truth.time_offsets_s)[[1, 3]].abs().max() < 0.5
 
 
-def test_residuals_at_all_lags_are_those_of_each_lag():
-    """The spectra's sums against distances computed point by point; at the right lag of perfect views nothing remains."""
+def test_residuals_at_all_lags_agree_with_sampson_distances():
+    """The residual at a lag is about the mean squared Sampson distance, and zero at the right lag without noise."""
     session = replace(SPEC, cameras=2, frames=40, regimes=(), clocks=Clocks()).generate()
-    places = session.observations.keypoints.movedim(-1, 1)
-    places, weights = places.nan_to_num(), session.observations.visible.double()
-    tracks = Tracks(places, weights, 10)
-    agreement = tracks.agreement(0, 1)
-    assert int(agreement.residual_px2.argmin()) == 10
-    assert agreement.residual_px2[10] < 1e-6
+    pixels = session.observations.keypoints.movedim(-1, 1)
+    pixels, weights = pixels.nan_to_num(), session.observations.visible.double()
+    tracks = Tracks(pixels, weights, 10)
+    fit = tracks.fit(0, 1)
+    assert int(fit.residual_px2.argmin()) == 10
+    assert fit.residual_px2[10] < 1e-6
     for lag in (-4, 3):
         found = tracks.distances_px(0, 1, lag)
         assert found is not None
         distances = found[0][found[0].isfinite()]
-        assert len(distances) == round(float(agreement.points[lag + 10]))
-        # Taubin's ratio of sums is the mean of ratios to first order
-        assert 0.5 < distances.square().mean() / agreement.residual_px2[lag + 10] < 2.0
+        assert len(distances) == round(float(fit.points[lag + 10]))
+        # Taubin's method has a ratio of sums in place of the mean of ratios
+        assert 0.5 < distances.square().mean() / fit.residual_px2[lag + 10] < 2.0
 
 
 def numbered(cameras: int, frames: int) -> Observations:
-    """Two points whose pixels tell camera and frame."""
+    """Two points whose pixel coordinates are the camera and the frame."""
     camera, frame = torch.meshgrid(torch.arange(cameras), torch.arange(frames), indexing="ij")
     keypoints = torch.stack([camera, frame], dim=-1)[:, :, None].expand(-1, -1, 2, -1).double()
     return Observations(keypoints, torch.eye(3), Stick(0, 1, 1.0), confidence=torch.ones(cameras, frames, 2))
 
 
-def test_frames_stand_where_the_common_axis_has_them():
+def test_frames_are_moved_to_the_nearest_common_frames():
     found = on_common_frames(numbered(3, 5), torch.tensor([0, 2.25, -3]))
-    moved = found.observations
-    assert (found.first, moved.num_frames) == (0, 5)
-    frames = moved.keypoints[:, :, 0, 1]
+    common = found.observations
+    assert (found.first, common.num_frames) == (0, 5)
+    frames = common.keypoints[:, :, 0, 1]
     nan = torch.nan
     expected = torch.tensor([[0, 1, 2, 3, 4], [nan, nan, 0, 1, 2], [3, 4, nan, nan, nan]]).double()
     torch.testing.assert_close(frames, expected, equal_nan=True)
     assert torch.equal(found.lags[1], torch.tensor([0, 0, 0.25, 0.25, 0.25]).double())
     assert torch.equal(found.index[1], torch.tensor([2, 3, 4, -1, -1]))
-    assert moved.confidence is not None
-    assert torch.equal(moved.visible, moved.confidence > 0)
-    back = found.to_own(moved.keypoints, torch.nan)
+    assert common.confidence is not None
+    assert torch.equal(common.visible, common.confidence > 0)
+    own = found.to_own(common.keypoints, torch.nan)
     kept = found.index >= 0
-    assert torch.equal(back[kept], numbered(3, 5).keypoints[kept])
-    assert bool(back[~kept].isnan().all())
+    assert torch.equal(own[kept], numbered(3, 5).keypoints[kept])
+    assert bool(own[~kept].isnan().all())
 
 
-def test_sessions_in_step_are_left_as_they_are():
+def test_synchronised_sessions_are_not_changed():
     given = numbered(2, 5)
     found = on_common_frames(given)
     assert found.observations is given
     assert bool((found.lags == 0).all())
 
 
-def test_cameras_of_different_rates_and_dropped_frames_meet_by_their_timestamps():
+def test_different_rates_and_dropped_frames_are_aligned_by_timestamps():
     nan = torch.nan
     times = torch.tensor(
         [[0, 0.02, 0.04, 0.06, 0.08, 0.10], [0.001, 0.041, 0.081, nan, nan, nan], [0, 0.02, nan, 0.06, 0.08, 0.1]]
@@ -141,7 +141,7 @@ def test_cameras_of_different_rates_and_dropped_frames_meet_by_their_timestamps(
     torch.testing.assert_close(found.lags[1, ::2], torch.full((3,), 0.05, dtype=torch.float64), rtol=1e-5, atol=0)
 
 
-def test_of_two_frames_at_one_common_frame_the_nearer_stays():
+def test_of_two_frames_at_one_common_frame_the_closer_one_is_kept():
     times = torch.tensor([[0, 0.02, 0.04], [0.001, 0.016, 0.04]]).double()
     found = on_common_frames(replace(numbered(2, 3), timestamps=times, fps=50.0))
     assert found.index.tolist() == [[0, 1, 2], [0, 1, 2]]
@@ -149,7 +149,7 @@ def test_of_two_frames_at_one_common_frame_the_nearer_stays():
     assert on_common_frames(replace(numbered(2, 3), timestamps=times, fps=50.0)).index.tolist() == [[-1, 0, 1], [-1, 0, 1]]
 
 
-def test_sessions_without_a_common_frame_are_refused():
+def test_sessions_without_a_common_frame_raise():
     with pytest.raises(ObservationError, match="no two cameras have a frame in common"):
         on_common_frames(numbered(2, 5), torch.tensor([0, 5]))
 
@@ -162,6 +162,6 @@ def test_sessions_without_a_common_frame_are_refused():
         ([[0.0, 1.0, 2.0], [0.0, 1.0, float("nan")]], "a frame without a timestamp"),
     ],
 )
-def test_timestamps_that_do_not_fit_are_refused(times: list[list[float]], message: str):
+def test_invalid_timestamps_raise(times: list[list[float]], message: str):
     with pytest.raises(ObservationError, match=message):
         replace(numbered(2, 3), timestamps=times)

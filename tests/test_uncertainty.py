@@ -1,4 +1,4 @@
-"""Covariances: against dense algebra, finite perturbations, and the scatter of simulated runs."""
+"""Covariances agree with dense linear algebra, with finite differences, and with the errors of simulated sessions."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from torchstickcal.solvers.uncertainty import (
 
 
 def deviation(calibration: Calibration, truth: Truth) -> torch.Tensor:
-    """Tangents (6 (C - 1),) that lead from the estimated poses to the true ones."""
+    """Tangents (6 (C - 1),) from the estimated poses to the true poses."""
     relative = truth.rotations @ truth.rotations[0].mT
     translations = truth.translations - relative @ truth.translations[0]
     back = calibration.rotations.mT
@@ -37,8 +37,8 @@ def deviation(calibration: Calibration, truth: Truth) -> torch.Tensor:
     return torch.cat([shift, rotation], dim=1)[1:].flatten()
 
 
-def test_camera_covariance_is_the_block_of_the_whole_inverse(disturbed: tuple[Measurements, State]):
-    """All unknowns together, the Hessian built column by column from the solver's own inverse."""
+def test_camera_covariance_is_the_camera_block_of_the_full_inverse(disturbed: tuple[Measurements, State]):
+    """The solver gives the inverse of the full Hessian column by column."""
     measurements, state = disturbed
     sigma = torch.full((1, measurements.points_per_frame), 2.0, dtype=torch.float64)
     losses: dict[str, Loss] = {"stick_length": StickLengthLoss(0.01), "reprojection": ReprojectionLoss()}
@@ -46,14 +46,14 @@ def test_camera_covariance_is_the_block_of_the_whole_inverse(disturbed: tuple[Me
     objective = Objective(measurements, {"reprojection": ReprojectionLoss(2.0), "stick_length": StickLengthLoss(0.01)})
     system = NormalEquations(objective, state, cameras_free=True)
     unit = torch.eye(18, dtype=torch.float64).view(18, 1, 3, 6)
-    nothing = torch.zeros_like(state.points)
-    none = nothing.new_zeros(1, 0)
-    columns = [system.solve(column, none, nothing)[0].flatten() for column in unit]
+    no_points = torch.zeros_like(state.points)
+    no_unknowns = no_points.new_zeros(1, 0)
+    columns = [system.solve(column, no_unknowns, no_points)[0].flatten() for column in unit]
     torch.testing.assert_close(found, torch.stack(columns), rtol=1e-8, atol=1e-14)
 
 
-def test_centres_and_scale_follow_the_tangents():
-    """First-order propagation against the retraction itself."""
+def test_covariances_of_centres_and_scale_follow_from_the_tangents():
+    """The first-order propagation agrees with a small retraction."""
     generator = torch.Generator().manual_seed(0)
     truth = golf_session(cameras=3, frames=2)[1]
     rotations, translations = truth.rotations, truth.translations
@@ -67,8 +67,8 @@ def test_centres_and_scale_follow_the_tangents():
     assert float(relative_scale_std(centres, covariance)) == pytest.approx(abs(expected), rel=1e-4)
 
 
-def test_a_point_is_as_uncertain_as_its_rays_and_its_cameras():
-    """Known cameras: the inverse of J^T J; uncertain ones: the same unknowns solved together."""
+def test_covariance_of_a_point_includes_keypoints_and_cameras():
+    """For known cameras it is the inverse of J^T J. Uncertain cameras add their propagated covariance."""
     observations, truth = golf_session(cameras=4, frames=2)
     assert truth.points is not None
     point = truth.points[0, :1]
@@ -98,22 +98,22 @@ def test_a_point_is_as_uncertain_as_its_rays_and_its_cameras():
     assert point_covariances(point, visible, sigma, poses, lens, still).isnan().all()
 
 
-def test_the_covariance_is_honest():
-    """The squared error in units of the covariance averages one, for cameras and for points they will yet triangulate."""
+def test_covariance_agrees_with_simulated_errors():
+    """The squared error divided by the covariance is 1 on average, for the cameras and for new points that they triangulate."""
     runs, normalised, ratios = 25, [], []
     for seed in range(runs):
         observations, truth = golf_session(cameras=4, frames=25, noise=Noise(sigma_px=1.0), seed=seed)
         calibration = calibrate(observations)
         error = deviation(calibration, truth)
         normalised.append(float(error @ torch.linalg.solve(calibration.covariance, error)) / len(error))
-        ratios.append(predicted_and_found(calibration, observations, truth, seed))
+        ratios.append(squared_error_over_predicted(calibration, observations, truth, seed))
     spread = (2 / (18 * runs)) ** 0.5
     assert abs(sum(normalised) / runs - 1) < 4 * spread + 0.05
     assert abs(sum(ratios) / runs - 1) < 0.15
 
 
-def predicted_and_found(calibration: Calibration, observations: Observations, truth: Truth, seed: int) -> float:
-    """Squared error of fresh points, triangulated with the calibrated cameras, over what was predicted."""
+def squared_error_over_predicted(calibration: Calibration, observations: Observations, truth: Truth, seed: int) -> float:
+    """Mean squared error of new points, triangulated with the calibrated cameras, divided by the predicted variance."""
     generator = torch.Generator().manual_seed(seed)
     centre = truth.points.mean((0, 1))
     fresh = centre + 0.4 * torch.randn(200, 3, generator=generator, dtype=torch.float64)
@@ -125,7 +125,7 @@ def predicted_and_found(calibration: Calibration, observations: Observations, tr
 
 
 def calibrate_points(calibration: Calibration, keypoints: torch.Tensor) -> torch.Tensor:
-    """Points (N, 3) of keypoints (C, N, 2) by least squares in the image, the cameras held."""
+    """Points (N, 3) that minimise the reprojection errors of keypoints (C, N, 2), with the cameras held fixed."""
     observations = Observations(
         keypoints[:, :, None],
         calibration.intrinsics,

@@ -1,4 +1,4 @@
-"""Threads of our own: one torch thread each, the caller's settings untouched."""
+"""Worker threads: one torch thread each, without a change of the caller's settings."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from torchstickcal.workers import map_on_workers, on_worker
 CPU = torch.device("cpu")
 
 
-def test_workers_have_one_thread_and_nobody_else_notices():
+def test_workers_have_one_torch_thread_and_other_threads_keep_theirs():
     before = torch.get_num_threads()
     assert on_worker(CPU, torch.get_num_threads) == 1
     later: list[int] = []
@@ -23,14 +23,14 @@ def test_workers_have_one_thread_and_nobody_else_notices():
     assert (torch.get_num_threads(), later) == (before, [before])
 
 
-def test_gradients_are_recorded_as_the_caller_wishes():
+def test_workers_use_the_gradient_mode_of_the_caller():
     x = torch.ones(2, requires_grad=True)
     assert on_worker(CPU, torch.square, x).requires_grad
     with torch.no_grad():
         assert not on_worker(CPU, torch.square, x).requires_grad
 
 
-def test_order_errors_and_work_within_work():
+def test_order_nested_calls_and_errors():
     assert map_on_workers(CPU, lambda k: on_worker(CPU, lambda: 2 * k), range(20)) == list(range(0, 40, 2))
     with pytest.raises(ZeroDivisionError):
         on_worker(CPU, lambda: 1 / 0)
@@ -42,7 +42,7 @@ def _threads_in_child(queue: multiprocessing.SimpleQueue[int]) -> None:
 
 @pytest.mark.skipif("fork" not in multiprocessing.get_all_start_methods(), reason="the system cannot fork")
 @pytest.mark.filterwarnings("ignore::DeprecationWarning")
-def test_a_forked_process_has_its_own():
+def test_a_forked_process_has_its_own_workers():
     on_worker(CPU, torch.get_num_threads)
     context = multiprocessing.get_context("fork")
     queue: multiprocessing.SimpleQueue[int] = context.SimpleQueue()

@@ -1,17 +1,27 @@
-"""The errors a user can meet: each says what is wrong, where, what came, what was expected and the mend."""
+"""Errors that the user can fix. Each says what is wrong, where, what was given, what was expected, and how to fix it."""
 
 from __future__ import annotations
 
 
 class CalibrationError(ValueError):
-    """Base of every error raised on purpose by torchstickcal.
+    """Base class of all errors that torchstickcal raises on purpose.
 
     Args:
-        what: the thing that is wrong, in one phrase.
-        where: the argument, file or key that holds it.
-        got: the offending value or shape.
-        expected: what would have been accepted.
-        remedy: how to mend it.
+        what: the problem, in one phrase.
+        where: the argument, file or key with the problem.
+        got: the given value or shape.
+        expected: what would be accepted.
+        remedy: how to fix the problem, one or more sentences.
+
+    Example:
+        >>> import torch
+        >>> from torchstickcal import CalibrationError, Observations, Stick
+        >>> keypoints = torch.zeros(3, 10, 21)
+        >>> try:
+        ...     Observations(keypoints, torch.eye(3), Stick(19, 20, length_m=1.0))
+        ... except CalibrationError as error:
+        ...     print(type(error).__name__, error.where, error.got)
+        ObservationError keypoints (3, 10, 21)
     """
 
     def __init__(self, what: str, *, where: str, got: object, expected: str, remedy: str = "") -> None:
@@ -21,16 +31,16 @@ class CalibrationError(ValueError):
 
 
 class ObservationError(CalibrationError):
-    """The observations cannot be used: shapes, values, sticks, intrinsics."""
+    """Observations that cannot be used: shapes, values, sticks, intrinsics."""
 
 
 class RigError(CalibrationError):
-    """The cameras do not share enough of the scene to be placed in one rig."""
+    """Cameras that have too few common points to be placed in one rig."""
 
 
 class ConfigError(CalibrationError):
-    """A configuration is unknown, has an unknown key or an unusable value."""
+    """A configuration that does not exist, or has an unknown key or an invalid value."""
 
 
 class FileFormatError(CalibrationError):
-    """A file is damaged, hostile or not of the format it claims to be."""
+    """A file that is damaged, unsafe, or not in the expected format."""

@@ -1,8 +1,8 @@
-"""Threads of our own for work on the CPU, each of which keeps torch to itself.
+"""Worker threads for work on the CPU, each with a single torch thread.
 
-The solvers' operations are small: shared among torch's threads they gain nothing on an idle machine and lose much on a busy
-one, where every matrix product waits for a thread that does not run. How many threads torch takes is a setting of the calling
-thread, so here it can be one without a change to the caller's.
+The solvers' operations are small. With several torch threads per operation they are no faster on an idle machine, and much
+slower on a busy one, where each matrix product waits for a thread that is not running. The number of torch threads is a setting
+of the calling thread. Worker threads can therefore use one torch thread without changing the caller's setting.
 """
 
 from __future__ import annotations
@@ -20,8 +20,8 @@ _Item = TypeVar("_Item")
 _Result = TypeVar("_Result")
 
 _pools: dict[int, ThreadPoolExecutor] = {}
-"""By process: threads do not survive a fork."""
-_here = threading.local()
+"""The pool of each process id, since threads do not survive a fork."""
+_this_thread = threading.local()
 
 
 def on_worker(
@@ -30,25 +30,25 @@ def on_worker(
     *arguments: _Arguments.args,
     **keywords: _Arguments.kwargs,
 ) -> _Result:
-    """A function's result; for work on the CPU, computed in a thread in which torch has one thread."""
+    """The result of a function. For a CPU device it runs in a worker thread."""
     if device.type != "cpu" or _is_worker():
         return function(*arguments, **keywords)
-    return _pool().submit(_as_here(function), *arguments, **keywords).result()
+    return _pool().submit(_with_grad_mode(function), *arguments, **keywords).result()
 
 
 def map_on_workers(device: torch.device, function: Callable[[_Item], _Result], items: Iterable[_Item]) -> list[_Result]:
-    """A function's results for several items; for work on the CPU, side by side in as many threads as torch has here."""
+    """The results of a function for several items. For a CPU device they run in parallel on the worker threads."""
     if device.type != "cpu" or _is_worker():
         return list(map(function, items))
-    return list(_pool().map(_as_here(function), items))
+    return list(_pool().map(_with_grad_mode(function), items))
 
 
 def _is_worker() -> bool:
-    return getattr(_here, "is_worker", False)
+    return getattr(_this_thread, "is_worker", False)
 
 
-def _as_here(function: Callable[_Arguments, _Result]) -> Callable[_Arguments, _Result]:
-    """The function under the caller's choice of whether to record gradients."""
+def _with_grad_mode(function: Callable[_Arguments, _Result]) -> Callable[_Arguments, _Result]:
+    """The function with the caller's gradient mode, which torch stores per thread."""
     enabled = torch.is_grad_enabled()
 
     def run(*arguments: _Arguments.args, **keywords: _Arguments.kwargs) -> _Result:
@@ -59,18 +59,18 @@ def _as_here(function: Callable[_Arguments, _Result]) -> Callable[_Arguments, _R
 
 
 def _pool() -> ThreadPoolExecutor:
-    """This process's threads."""
+    """The workers of this process, as many as torch has threads when they are first used."""
     if os.getpid() not in _pools:
         threads = torch.get_num_threads()
-        pool = ThreadPoolExecutor(threads, "torchstickcal", initializer=_become_worker)
+        pool = ThreadPoolExecutor(threads, "torchstickcal", initializer=_initialise_worker)
         all_started = threading.Barrier(threads)
         list(pool.map(lambda _: all_started.wait(), range(threads)))
-        torch.set_num_threads(threads)  # what threads started later begin with
+        torch.set_num_threads(threads)  # restore the default for threads that are started later
         _pools[os.getpid()] = pool
     return _pools[os.getpid()]
 
 
-def _become_worker() -> None:
-    _here.is_worker = True
-    torch.get_num_threads()  # a thread that has not asked yet would take everybody's number at its first operation
+def _initialise_worker() -> None:
+    _this_thread.is_worker = True
+    torch.get_num_threads()  # without this call, the first operation of the thread would reset the number to the default
     torch.set_num_threads(1)

@@ -1,4 +1,4 @@
-"""Watching a calibration in TensorBoard."""
+"""TensorBoard logs of a calibration."""
 
 from __future__ import annotations
 
@@ -13,13 +13,25 @@ from torchstickcal.solvers import IterationRecord
 
 
 class TensorBoardMonitor:
-    """A callback of :func:`torchstickcal.calibrate` that writes what happens to a TensorBoard log.
+    """A callback of :func:`torchstickcal.calibrate` that writes a TensorBoard log.
 
-    Per stage and iteration: the value of each loss, damping, step, reprojection of each camera and the sticks' mean length, on
-    from where the stage ended if it runs again; at the end a figure of the rig and the summary table.
+    It logs for each stage and iteration: the cost and the value of each loss, the damping, the step, the reprojection error of
+    each camera and the mean stick length. If a stage runs again, its curves continue. At the end it logs a figure of the rig
+    and the summary table. View the log with ``tensorboard --logdir LOG_DIR``.
 
     Args:
-        log_dir: folder of the log, made if need be.
+        log_dir: folder of the log. It is created if it does not exist.
+
+    Example:
+        >>> import tempfile
+        >>> from pathlib import Path
+        >>> from torchstickcal import TensorBoardMonitor, calibrate
+        >>> from torchstickcal.simulate import golf_session
+        >>> observations, truth = golf_session(cameras=3, frames=5)
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     calibration = calibrate(observations, callback=TensorBoardMonitor(folder))
+        ...     len(list(Path(folder).glob("events.out.tfevents.*")))
+        1
     """
 
     def __init__(self, log_dir: str | Path) -> None:
@@ -39,7 +51,7 @@ class TensorBoardMonitor:
             self._writer.add_scalar(f"{stage}/{name}", value, step)
 
     def on_end(self, calibration: Calibration) -> None:
-        """Write the result and close the log."""
+        """Write the figure and the summary, and close the log."""
         self._writer.add_figure("rig", rig_figure(calibration))
         self._writer.add_text("summary", "\n".join(f"    {line}" for line in table(calibration).splitlines()))
         self._writer.close()

@@ -1,4 +1,4 @@
-"""Two solvers behind one interface: Gauss-Newton with exact elimination, and torch.optim.LBFGS."""
+"""Two solvers with the same interface: Gauss-Newton with exact elimination of the points, and torch.optim.LBFGS."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ SOLVERS = ("gauss_newton", "lbfgs")
 
 
 def solver(name: str) -> Solver:
-    """The solver of a name in ``SOLVERS``; kornia is imported only for the one that needs it."""
+    """The solver with one of the names in ``SOLVERS``. Only ``lbfgs`` imports kornia."""
     if name == "lbfgs":
         from torchstickcal.solvers.lbfgs import lbfgs
 

@@ -1,4 +1,4 @@
-"""What every solver takes and gives: when to stop, why it stopped, and a record of each iteration."""
+"""The interface of the solvers: stopping criteria, stopping reasons, and a record of each iteration."""
 
 from __future__ import annotations
 
@@ -12,29 +12,30 @@ from torchstickcal.model.state import State
 
 
 class Stop(StrEnum):
-    """Why a solver stopped; the value is the sentence to show."""
+    """Why a solver stopped. The value is the message for the user."""
 
     COST = "converged: the cost no longer falls"
     CAMERAS = "converged: the cameras no longer move"
-    EXACT = "converged: the residuals are at rounding"
+    EXACT = "converged: the residuals are zero up to rounding errors"
     ITERATIONS = "stopped at the limit of iterations"
     DIVERGED = "stopped: no step lowers the cost"
 
     @property
     def converged(self) -> bool:
-        """Whether the state is a minimum to the tolerance asked for."""
+        """Whether the state is a minimum within the requested tolerance."""
         return self in {Stop.COST, Stop.CAMERAS, Stop.EXACT}
 
 
 @dataclass(frozen=True)
 class Termination:
-    """When to stop.
+    """Stopping criteria.
 
     Args:
-        max_iterations: limit of iterations, each one evaluation of the derivatives.
-        cost_tolerance: relative decrease of the cost, promised or reached, below which it has converged.
-        camera_tolerance: step of the cameras below which it has converged, in standard deviations of their estimate. It
-            ends a run in which nothing moves any more but single points that outliers leave undetermined.
+        max_iterations: largest number of iterations. Each iteration evaluates the derivatives once.
+        cost_tolerance: the solver has converged when the predicted or the actual relative decrease of the cost is below this.
+        camera_tolerance: the solver has converged when the step of the cameras is below this, in standard deviations of the
+            cameras. This criterion stops a run in which only poorly determined points still move, such as points with
+            outliers.
     """
 
     max_iterations: int = 100
@@ -47,25 +48,25 @@ class IterationRecord:
     """One iteration of one stage."""
 
     session: int
-    """which of the sessions solved together"""
+    """index of the session in the batch"""
     stage: str
     iteration: int
     cost: float
     terms: dict[str, float]
-    """value of each loss; they add up to the cost"""
+    """value of each loss; the cost is their sum"""
     damping: float
-    """Levenberg-Marquardt's factor; 0 where the solver has none"""
+    """damping factor of Levenberg-Marquardt; 0 for a solver without damping"""
     step_m: float
-    """largest movement of a camera or point by the step that led here, metres"""
+    """largest component of the last step of cameras and points (m; radians for rotations)"""
     reprojection_px: tuple[float, ...]
-    """weighted root mean square reprojection residual of each camera"""
+    """weighted root mean square reprojection error of each camera"""
     stick_length_m: float
     """mean length of the reconstructed sticks; NaN without sticks"""
 
 
 @dataclass(frozen=True)
 class StageRecord:
-    """What happened in one stage."""
+    """The course of one stage."""
 
     name: str
     stop: Stop
@@ -77,22 +78,22 @@ Listener = Callable[[IterationRecord], None]
 
 
 def unheard(record: IterationRecord) -> None:
-    """The listener where nobody listens."""
+    """A listener that ignores the record."""
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """Where a solver ended, why, and how it got there, for B sessions."""
+    """Result of a solver for B sessions."""
 
     state: State
     stops: tuple[Stop, ...]
-    """one for each session"""
+    """why each session stopped"""
     iterations: tuple[tuple[IterationRecord, ...], ...]
-    """those of each session"""
+    """the records of each session"""
 
 
 class Solver(Protocol):
-    """Minimises an objective from a state, each session on its own."""
+    """A function that minimises an objective, for each session independently."""
 
     def __call__(
         self,
@@ -104,5 +105,5 @@ class Solver(Protocol):
         stage: str,
         listener: Listener,
     ) -> Outcome:
-        """Minimise; the first camera, or with ``cameras_free=False`` every camera, stays where it is."""
+        """Minimise from a state. The first camera is held fixed; with ``cameras_free=False`` all cameras are."""
         ...

@@ -1,7 +1,7 @@
-"""Levenberg-Marquardt on the exactly reduced system; robust kernels by iteratively re-weighted least squares.
+"""Levenberg-Marquardt on the reduced camera system, with robust kernels by iteratively re-weighted least squares.
 
-Several sessions descend side by side: each round builds one system for all of them, each session judges its own step, chooses
-its own damping and stops for its own reason.
+All sessions of a batch are solved together: each round builds one system for all of them. Each session accepts or rejects its
+own step, has its own damping, and stops by its own criterion.
 """
 
 from __future__ import annotations
@@ -16,13 +16,17 @@ from torchstickcal.solvers.base import IterationRecord, Listener, Outcome, Stop,
 from torchstickcal.solvers.elimination.normal_equations import NormalEquations, Step
 
 _INITIAL_DAMPING = 1e-5
-_MIN_DAMPING = 1e-14
-_MAX_DAMPING = 1e8
-_LOOSEN = 0.03
-_SHORT_LEASH = 0.5
-_NOTHING = 0.01
-_LARGE_BLOCK_BYTES = 31 * 2**20
+_MIN_DAMPING, _MAX_DAMPING = 1e-14, 1e8
+_DECREASE, _KEEP, _INCREASE = 0.03, 1.0, 4.0
+"""Factors on the damping after an accepted step."""
+_GOOD_AGREEMENT, _FAIR_AGREEMENT = 0.75, 0.25
+"""Actual over predicted decrease of the cost from which the damping is decreased, and from which it is kept."""
+_MAX_DAMPED_SHARE = 0.5
+"""A step with a larger ``Step.damped_share`` is short because of its damping, and no sign of convergence."""
+_NEGLIGIBLE_SHARE = 0.01
+"""A step that predicts less than this share of the cost tolerance is not tried."""
 _EXACT_COST_PER_KEYPOINT = 1e-18
+_LARGE_BLOCK_BYTES = 31 * 2**20
 
 
 def gauss_newton(
@@ -34,78 +38,75 @@ def gauss_newton(
     stage: str,
     listener: Listener,
 ) -> Outcome:
-    """Minimise an objective over the points and, unless held, all cameras but the first.
+    """Minimise an objective over the points and, with ``cameras_free``, over all cameras but the first.
 
-    A step is taken only if it lowers the cost, so the state returned is never worse than the one given.
+    A step is accepted only if it lowers the cost. So the result is never worse than the initial state.
     """
-    _keep_freed_memory()
+    _raise_allocator_threshold()
+    device = state.points.device
     keypoints = objective.measurements.visible.sum((1, 2)).tolist()
-    descents = [_Descent(termination, _EXACT_COST_PER_KEYPOINT * count) for count in keypoints]
-    records: list[list[IterationRecord]] = [[] for _ in descents]
+    sessions = [_SessionControl(termination, _EXACT_COST_PER_KEYPOINT * count) for count in keypoints]
+    records: list[list[IterationRecord]] = [[] for _ in sessions]
     best = trial = state
-    steps_m = [0.0] * len(descents)
+    steps_m = [0.0] * len(sessions)
     while True:
-        damping = torch.tensor([descent.damping for descent in descents], dtype=torch.float64, device=state.points.device)
+        damping = torch.tensor([session.damping for session in sessions], dtype=torch.float64, device=device)
         system = NormalEquations(objective, trial, cameras_free, damping)
-        lowered = [descent.judge(cost) for descent, cost in zip(descents, system.cost.tolist(), strict=True)]
-        if all(lowered):
-            best = trial
-        elif any(lowered):
-            best = best.replaced(torch.tensor(lowered, device=state.points.device), trial)
-        if any(lowered):
-            iterations = [descent.iteration for descent in descents]
-            found = system.records(stage, iterations, damping.tolist(), steps_m)
-            for session, record in enumerate(found):
-                if lowered[session]:
-                    records[session].append(record)
+        accepted = [session.accept(cost) for session, cost in zip(sessions, system.cost.tolist(), strict=True)]
+        if any(accepted):
+            best = trial if all(accepted) else best.replaced(torch.tensor(accepted, device=device), trial)
+            iterations = [session.iteration for session in sessions]
+            for number, record in enumerate(system.records(stage, iterations, damping.tolist(), steps_m)):
+                if accepted[number]:
+                    records[number].append(record)
                     listener(record)
-        moving = [False] * len(descents)
-        if any(descent.ready for descent in descents):
+        has_trial = [False] * len(sessions)
+        if any(session.at_best for session in sessions):
             step = system.step()
-            promises = (step.solved, step.predicted_decrease, step.leash, step.camera_sigmas)
-            for descent, *promise in zip(descents, *(promise.tolist() for promise in promises), strict=True):
-                descent.propose(*promise)
-            moving = [descent.moving for descent in descents]
-            steps_m = _largest_movements(step)
+            results = (step.solved, step.predicted_decrease, step.damped_share, step.camera_sigmas)
+            for session, *result in zip(sessions, *(result.tolist() for result in results), strict=True):
+                session.plan(*result)
+            has_trial = [session.has_trial for session in sessions]
+            steps_m = _largest_components(step)
             trial = best.retracted(step.cameras, step.points, step.unknowns)
             del step
         del system
-        if all(descent.stop for descent in descents):
-            stops = tuple(descent.stop or Stop.ITERATIONS for descent in descents)
+        if all(session.stop for session in sessions):
+            stops = tuple(session.stop or Stop.ITERATIONS for session in sessions)
             return Outcome(best, stops, tuple(map(tuple, records)))
-        if not all(moving):
-            trial = best.replaced(torch.tensor(moving, device=state.points.device), trial) if any(moving) else best
+        if not all(has_trial):
+            trial = best.replaced(torch.tensor(has_trial, device=device), trial) if any(has_trial) else best
 
 
-class _Descent:
-    """How one session goes down: it judges where its step has led, and proposes the next.
+class _SessionControl:
+    """Step acceptance, damping and convergence of one session.
 
-    The system at a trial is built with the damping of the step to follow, chosen before the trial's cost is known. Where
-    that turns out wrong, the session goes back to the best state and builds its system there again.
+    The system at a trial state already needs the damping of the next step, before the cost of the trial is known. If the trial
+    is rejected, the session goes back to its best state, and the next round builds the system there with a larger damping.
     """
 
     def __init__(self, termination: Termination, exact_cost: float) -> None:
         self._termination, self._exact_cost = termination, exact_cost
-        self._cost, self._predicted, self._leash, self._sigmas = math.inf, 0.0, 0.0, math.inf
-        self._step_damping, self._factor, self._refused = _INITIAL_DAMPING, _LOOSEN, False
+        self._cost, self._predicted, self._damped_share, self._camera_sigmas = math.inf, 0.0, 0.0, math.inf
+        self._trial_damping, self._factor, self._rejected = _INITIAL_DAMPING, _DECREASE, False
         self.damping = _INITIAL_DAMPING
         self.iteration = -1
         self.stop: Stop | None = None
-        self.moving = True
-        """whether the trial is another state than the best"""
-        self.ready = False
-        """whether the system just built is that of the best state"""
+        self.has_trial = True
+        """whether the session has a trial state that differs from its best state"""
+        self.at_best = False
+        """whether the last system was built at the session's best state"""
 
-    def judge(self, cost: float) -> bool:
-        """Take in the cost of the trial; True if it is the new best."""
-        self.ready = self.stop is None
-        if self.stop is not None or not self.moving:
+    def accept(self, cost: float) -> bool:
+        """Take the cost of the last system; True if its state is the new best state."""
+        self.at_best = self.stop is None
+        if self.stop is not None or not self.has_trial:
             return False
         if self.iteration >= 0:
             if not cost < self._cost:
-                self._refuse()
+                self._on_rejected()
                 return False
-            self._conclude(self._cost - cost)
+            self._on_accepted(self._cost - cost)
         self._cost = cost
         self.iteration += 1
         if not math.isfinite(cost):
@@ -114,63 +115,65 @@ class _Descent:
             self.stop = Stop.EXACT
         elif self.stop is None and self.iteration == self._termination.max_iterations:
             self.stop = Stop.ITERATIONS
-        self.ready = self.stop is None
+        self.at_best = self.stop is None
         return True
 
-    def propose(self, solved: bool, predicted: float, leash: float, sigmas: float) -> None:
-        """Take in what the step from the best state promises: go there, stay with another damping, or stop."""
-        self.moving = False
-        if not self.ready:
+    def plan(self, solved: bool, predicted: float, damped_share: float, camera_sigmas: float) -> None:
+        """Decide about a step from the best state, by the fields of :class:`Step`: try it, change the damping, or stop."""
+        self.has_trial = False
+        if not self.at_best:
             return
         if not solved:
             self._raise_damping(self.damping)
-        elif predicted <= _NOTHING * self._termination.cost_tolerance * self._cost:
-            # A step that promises next to nothing is a sign of convergence only if it is not damping that keeps it short.
-            if self._refused or leash < _SHORT_LEASH or self.damping <= _MIN_DAMPING:
+        elif predicted <= _NEGLIGIBLE_SHARE * self._termination.cost_tolerance * self._cost:
+            # A small predicted decrease means convergence only if the damping is not the reason for it.
+            if self._rejected or damped_share < _MAX_DAMPED_SHARE or self.damping <= _MIN_DAMPING:
                 self.stop = Stop.COST
-            self.damping = max(self.damping * _LOOSEN, _MIN_DAMPING)
+            self.damping = max(self.damping * _DECREASE, _MIN_DAMPING)
         else:
-            self.moving = True
-            self._predicted, self._leash, self._sigmas = predicted, leash, sigmas
-            self._step_damping = self.damping
+            self.has_trial = True
+            self._predicted, self._damped_share, self._camera_sigmas = predicted, damped_share, camera_sigmas
+            self._trial_damping = self.damping
             self.damping = max(self.damping * self._factor, _MIN_DAMPING)
 
-    def _conclude(self, decrease: float) -> None:
-        """After a step that lowered the cost: how far to trust the next, and whether this was the last."""
+    def _on_accepted(self, decrease: float) -> None:
+        """Choose the next damping by the actual decrease of the cost, and test for convergence."""
         agreement = decrease / self._predicted
-        self._factor = _LOOSEN if agreement > 0.75 else 1.0 if agreement > 0.25 else 4.0
-        self._refused = False
-        if self._leash < _SHORT_LEASH:
+        self._factor = _DECREASE if agreement > _GOOD_AGREEMENT else _KEEP if agreement > _FAIR_AGREEMENT else _INCREASE
+        self._rejected = False
+        if self._damped_share < _MAX_DAMPED_SHARE:
             if decrease <= self._termination.cost_tolerance * self._cost:
                 self.stop = Stop.COST
-            elif self._sigmas <= self._termination.camera_tolerance:
+            elif self._camera_sigmas <= self._termination.camera_tolerance:
                 self.stop = Stop.CAMERAS
 
-    def _refuse(self) -> None:
-        """After a step that did not lower the cost."""
-        self.ready = self.moving = False
+    def _on_rejected(self) -> None:
+        """Go back to the best state with a larger damping, or stop if the step predicted almost nothing."""
+        self.at_best = self.has_trial = False
         if self._predicted <= self._termination.cost_tolerance * self._cost:
             self.stop = Stop.COST
         else:
-            self._raise_damping(self._step_damping)
+            self._raise_damping(self._trial_damping)
 
-    def _raise_damping(self, above: float) -> None:
-        self._refused, self._factor = True, 1.0
-        self.damping = max(above, 1e-8) * 10
+    def _raise_damping(self, damping: float) -> None:
+        """Set the damping to ten times a value that was too small, or stop if it becomes too large."""
+        self._rejected, self._factor = True, _KEEP
+        self.damping = max(damping, 1e-8) * 10
         if self.damping > _MAX_DAMPING:
             self.stop = Stop.DIVERGED
 
 
-def _keep_freed_memory() -> None:
-    """Have the C library keep freed blocks of the size of our arrays, as it does once it has seen a larger one freed.
+def _raise_allocator_threshold() -> None:
+    """Make the C library keep freed arrays for reuse.
 
-    glibc otherwise gives each back to the system, and the first touch of every page of the next one costs more than the
-    arithmetic on it.
+    glibc returns a large block to the system when it is freed, and the page faults of the next allocation then cost more than
+    the arithmetic. Its threshold for a large block rises to the largest block freed so far: so free one larger than our arrays.
     """
     torch.empty(_LARGE_BLOCK_BYTES, dtype=torch.uint8)
 
 
-def _largest_movements(step: Step) -> list[float]:
+def _largest_components(step: Step) -> list[float]:
+    """Largest absolute component of each session's step."""
     largest = step.points.abs().amax((1, 2))
     if step.cameras.numel():
         largest = torch.maximum(largest, step.cameras.abs().amax((1, 2)))

@@ -1,8 +1,9 @@
-"""torch.optim.LBFGS on the same objective, through autograd.
+"""torch.optim.LBFGS on the same objective, with gradients by autograd.
 
-The unknowns are scaled by Cholesky factors of the Gauss-Newton system, of each point's block and of the reduced camera
-system, and the points follow the cameras as that system has them do. Without it the method needs thousands of iterations,
-and stalls where only the sum of all points sees a direction, as it is with the scale.
+The unknowns are preconditioned by the Gauss-Newton system: with Cholesky factors of each point's Hessian block and of the
+reduced camera system, and with the movement of the points that a camera step implies (``-H_xx^-1 H_xc``). Without
+preconditioning the method needs thousands of iterations. It then stalls in directions that each single point determines weakly,
+such as the scale.
 """
 
 from __future__ import annotations
@@ -20,32 +21,32 @@ from torchstickcal.solvers.base import IterationRecord, Listener, Outcome, Stop,
 from torchstickcal.solvers.elimination.normal_equations import NormalEquations
 from torchstickcal.solvers.elimination.points import PointElimination
 
-_ITERATIONS_A_ROUND = 100
+_ITERATIONS_PER_ROUND = 100
 _DAMPING = 1e-6
 
 
-class _ScaledUnknowns:
-    """Poses and points of one session as functions of well-scaled unknowns that are zero at the start."""
+class _PreconditionedState:
+    """The state of one session as a function of preconditioned unknowns, which are zero at the initial state."""
 
     def __init__(self, system: NormalEquations, start: State) -> None:
         hessian, no_pairs = raised(system.point_hessian, _DAMPING), system.objective.measurements.sticks[:0, 0]
-        self._points = PointElimination(hessian, no_pairs, no_pairs, None)
-        self._cameras = torch.linalg.cholesky(system.reduced[0]).mT
-        self._response = system.response()[0].flatten(1).mT
+        self._point_factor = PointElimination(hessian, no_pairs, no_pairs, None)
+        self._camera_factor = torch.linalg.cholesky(system.reduced[0]).mT
+        self._point_response = system.point_response()[0].flatten(1).mT
         self._extrinsics = Extrinsics(start.rotations[0], start.translations[0])
-        self._start, self._count = start, start.rotations.shape[1] - 1
-        self.camera = start.points.new_zeros(len(self._cameras), 1).requires_grad_()
-        self.point = torch.zeros_like(start.points).requires_grad_()
+        self._start, self._free_cameras = start, start.rotations.shape[1] - 1
+        self.cameras = start.points.new_zeros(len(self._camera_factor), 1).requires_grad_()
+        self.points = torch.zeros_like(start.points).requires_grad_()
 
     def state(self) -> State:
-        """The state, differentiable by the unknowns."""
-        points = self._start.points + self._points.back_solve(self.point)
-        if not self.camera.numel():
+        """The state, differentiable with respect to the preconditioned unknowns."""
+        points = self._start.points + self._point_factor.backward_solve(self.points)
+        if not self.cameras.numel():
             return replace(self._start, points=points)
-        step = torch.linalg.solve_triangular(self._cameras, self.camera, upper=True)
-        tangents, unknowns = step.split([6 * self._count, len(step) - 6 * self._count])
+        step = torch.linalg.solve_triangular(self._camera_factor, self.cameras, upper=True)
+        tangents, unknowns = step.split([6 * self._free_cameras, len(step) - 6 * self._free_cameras])
         rotations, translations = self._extrinsics.compose(tangents.view(-1, 6))
-        points = points + (self._response @ step).view_as(points)
+        points = points + (self._point_response @ step).view_as(points)
         return State(
             torch.cat([self._start.rotations[:, :1], rotations[None]], dim=1),
             torch.cat([self._start.translations[:, :1], translations[None]], dim=1),
@@ -63,24 +64,24 @@ def lbfgs(
     stage: str,
     listener: Listener,
 ) -> Outcome:
-    """Minimise an objective over the points and, unless held, all cameras but the first, one session after the other.
+    """Minimise an objective over the points and, with ``cameras_free``, over all cameras but the first.
 
-    It runs in rounds, each with fresh scales and a fresh history; a record stands for a round, and the limit of iterations
-    counts rounds.
+    The sessions are solved one after another, in rounds. Each round renews the preconditioner and starts LBFGS with an empty
+    history. There is one record per round, and ``max_iterations`` counts rounds.
     """
     states: list[State] = []
     stops: list[Stop] = []
     records: list[tuple[IterationRecord, ...]] = []
     for session in range(objective.measurements.sessions):
         one = slice(session, session + 1)
-        ended, stop, heard = _descend(objective[one], state[one], session, cameras_free, termination, stage, listener)
-        states.append(ended)
+        final, stop, rounds = _solve_session(objective[one], state[one], session, cameras_free, termination, stage, listener)
+        states.append(final)
         stops.append(stop)
-        records.append(heard)
+        records.append(rounds)
     return Outcome(State.stack(states), tuple(stops), tuple(records))
 
 
-def _descend(
+def _solve_session(
     objective: Objective,
     state: State,
     session: int,
@@ -101,7 +102,7 @@ def _descend(
             break
         if iteration == termination.max_iterations:
             break
-        moved = _round(objective, _ScaledUnknowns(system, state))
+        moved = _run_round(objective, _PreconditionedState(system, state))
         if not bool(moved.points.isfinite().all()):
             stop = Stop.DIVERGED
             break
@@ -110,11 +111,12 @@ def _descend(
     return state, stop, tuple(records)
 
 
-def _round(objective: Objective, unknowns: _ScaledUnknowns) -> State:
+def _run_round(objective: Objective, preconditioned: _PreconditionedState) -> State:
+    """The state after one run of LBFGS."""
     optimiser = torch.optim.LBFGS(
-        [unknowns.camera, unknowns.point],
-        max_iter=_ITERATIONS_A_ROUND,
-        history_size=_ITERATIONS_A_ROUND,
+        [preconditioned.cameras, preconditioned.points],
+        max_iter=_ITERATIONS_PER_ROUND,
+        history_size=_ITERATIONS_PER_ROUND,
         line_search_fn="strong_wolfe",
         tolerance_grad=0.0,
         tolerance_change=0.0,
@@ -122,10 +124,10 @@ def _round(objective: Objective, unknowns: _ScaledUnknowns) -> State:
 
     def closure() -> Tensor:
         optimiser.zero_grad()
-        cost = torch.stack(list(objective.terms(unknowns.state()).values())).sum()
+        cost = torch.stack(list(objective.terms(preconditioned.state()).values())).sum()
         cost.backward()
         return cost
 
     optimiser.step(closure)  # pyright: ignore[reportArgumentType]
     with torch.no_grad():
-        return unknowns.state()
+        return preconditioned.state()

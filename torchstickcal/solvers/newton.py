@@ -1,4 +1,7 @@
-"""The last steps to a minimum, with the exact Hessian: quadratic where Gauss-Newton is linear."""
+"""Newton iterations with the exact Hessian, to take a solver's result to the minimum up to rounding errors.
+
+Newton's method converges quadratically where Gauss-Newton converges only linearly.
+"""
 
 from __future__ import annotations
 
@@ -10,15 +13,17 @@ from torchstickcal.solvers.elimination.normal_equations import NormalEquations
 
 _MAX_STEPS = 8
 _STEP_SIGMAS = 1e-9
+"""Length of a step, in standard deviations of the estimate, below which a session has converged."""
 _ROUNDING = 1e-12
+"""Relative increase of the cost that counts as rounding error."""
 
 
 def polish(objective: Objective, state: State, cameras_free: bool) -> State:
-    """Where Newton's method leads from a state near a minimum; a session in which it leads nowhere stays as it is.
+    """The minimum near a state, by Newton's method. A session in which no step lowers the cost keeps its state.
 
     Args:
-        objective: what is least at the minimum; its track losses have to be quadratic.
-        state: where a solver has ended.
+        objective: the objective to minimise. Its track losses must be quadratic.
+        state: the result of a solver.
         cameras_free: whether all cameras but the first are unknowns too.
     """
     best, cost = state, torch.full((objective.measurements.sessions,), torch.inf, dtype=torch.float64)
@@ -26,16 +31,15 @@ def polish(objective: Objective, state: State, cameras_free: bool) -> State:
     trial = state
     for _ in range(_MAX_STEPS):
         system = NormalEquations(objective, trial, cameras_free, exact=True)
-        lower = system.cost <= cost * (1 + _ROUNDING)
-        best, cost = best.replaced(lower, trial), torch.minimum(system.cost, cost)
+        accepted = system.cost <= cost * (1 + _ROUNDING)
+        best, cost = best.replaced(accepted, trial), torch.minimum(system.cost, cost)
         gradient = system.camera_gradient, system.unknown_gradient, system.point_gradient
-        cameras, unknowns, points, solved = system.solve(*gradient)
-        squared_sigmas = sum(
-            ((by * of).flatten(1).sum(1) for by, of in zip(gradient, (cameras, unknowns, points), strict=True)),
-            torch.zeros_like(cost),
-        )
-        moving = lower & solved & (squared_sigmas > _STEP_SIGMAS**2)
+        *step, solved = system.solve(*gradient)
+        products = ((part * by).flatten(1).sum(1) for part, by in zip(gradient, step, strict=True))
+        squared_sigmas = sum(products, torch.zeros_like(cost))
+        moving = accepted & solved & (squared_sigmas > _STEP_SIGMAS**2)
         if not bool(moving.any()):
             break
+        cameras, unknowns, points = step
         trial = best.replaced(moving, best.retracted(-cameras, -points, -unknowns))
     return best

@@ -1,4 +1,4 @@
-"""A first estimate of the rig, from nothing: pairs, spanning tree, triangulation (the paper's initialisation)."""
+"""Initialisation of the rig from keypoints alone, as in the paper: relative poses of pairs, spanning tree, triangulation."""
 
 from __future__ import annotations
 
@@ -18,7 +18,8 @@ from torchstickcal.pipeline.initialise.views import Views
 
 __all__ = ["initialise", "triangulated"]
 
-_SUPPORT_RADIUS = 10.0
+_SUPPORT_SCALE = 10.0
+"""Scale of the robust kernels in units of the inlier threshold of RANSAC."""
 
 
 def initialise(measurements: Measurements, settings: InitialiseSettings, labels: Sequence[str]) -> State:
@@ -27,33 +28,39 @@ def initialise(measurements: Measurements, settings: InitialiseSettings, labels:
     Args:
         measurements: one session.
         settings: thresholds.
-        labels: the cameras' names, for messages.
+        labels: names of the cameras, for error messages.
 
     Raises:
-        RigError: if the cameras do not hang together.
+        RigError: if the cameras do not have enough common points.
     """
     views = Views(measurements)
-    find = partial(relate, views, max_points=settings.max_points, threshold_px=settings.threshold_px)
-    edges = spanning_tree(views.common(), find, labels, settings.min_common_points)
-    scale = _scale(measurements, settings)
-    poses = propagate(edges, views, scale)
+    relate_pair = partial(relate, views, max_points=settings.max_points, threshold_px=settings.threshold_px)
+    edges = spanning_tree(views.common(), relate_pair, labels, settings.min_common_points)
+    poses = propagate(edges, views, _kernel_scale(measurements, settings))
     rotations, translations = (torch.from_numpy(pose)[None].to(measurements.pixels.device) for pose in poses)
     return State.of(rotations, translations, triangulated(measurements, rotations, translations, settings))
 
 
 def triangulated(measurements: Measurements, rotations: Tensor, translations: Tensor, settings: InitialiseSettings) -> Tensor:
-    """The points (1, 3, N) of one session at poses (1, C, 3, 3), (1, C, 3); zero where fewer than two cameras see them."""
-    scale = _scale(measurements, settings)
+    """Triangulated points (1, 3, N) of one session, zero if fewer than two cameras see a point.
+
+    Args:
+        measurements: one session.
+        rotations: (1, C, 3, 3), world to camera.
+        translations: (1, C, 3), world to camera.
+        settings: thresholds.
+    """
+    scale = _kernel_scale(measurements, settings)
     points = rotations.new_zeros(1, 3, measurements.num_columns)
     for columns in measurements.chunks():
         pixels = measurements.pixels[0][..., columns].double().movedim(1, -1)
         rays = measurements.cameras[0].undistort(pixels).movedim(-1, 1)
         weights = measurements.confidence[0][:, columns].double() * rays.isfinite().all(1)
-        found = triangulate(rotations[0], translations[0], rays.nan_to_num(), weights, scale=scale)
-        points[0, :, columns] = found.nan_to_num()
+        chunk = triangulate(rotations[0], translations[0], rays.nan_to_num(), weights, scale=scale)
+        points[0, :, columns] = chunk.nan_to_num()
     return points
 
 
-def _scale(measurements: Measurements, settings: InitialiseSettings) -> float:
-    """Residual, in normalised coordinates, up to which a keypoint supports a pose."""
-    return _SUPPORT_RADIUS * settings.threshold_px / float(measurements.cameras.focal_px.mean())
+def _kernel_scale(measurements: Measurements, settings: InitialiseSettings) -> float:
+    """Scale of the robust kernels, in normalised image coordinates."""
+    return _SUPPORT_SCALE * settings.threshold_px / float(measurements.cameras.focal_px.mean())

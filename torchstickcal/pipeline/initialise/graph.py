@@ -1,4 +1,4 @@
-"""From pairs to a rig: a maximum spanning tree, and poses propagated along it."""
+"""From pairs of cameras to a rig: a maximum spanning tree, and poses propagated along its edges."""
 
 from __future__ import annotations
 
@@ -15,12 +15,14 @@ from torchstickcal.pipeline.initialise.triangulate import triangulate
 from torchstickcal.pipeline.initialise.views import Array, Views, spread
 
 _PLAUSIBLE_SHARE = 0.5
-_NEARLY_ALL = 0.9
+"""Number of points in front of both cameras, relative to the best pose, from which a pose is plausible."""
+_SUFFICIENT_INLIERS = 0.9
+"""Inliers over common points from which a pair joins the tree without comparison with other pairs."""
 _MAX_POINTS = 400
 
 
 class Edge(NamedTuple):
-    """A branch of the tree: a placed camera and the camera to place from it."""
+    """An edge of the tree, from a camera with a known pose to the next camera."""
 
     parent: int
     child: int
@@ -30,31 +32,32 @@ class Edge(NamedTuple):
 def spanning_tree(
     common: NDArray[np.int_], relate: Callable[[int, int], Pair], labels: Sequence[str], min_common: int
 ) -> list[Edge]:
-    """Maximum spanning tree over inlier counts, rooted at the first camera, in the order of growth.
+    """Edges of the maximum spanning tree over the inlier counts, from the first camera on (Prim's algorithm).
 
-    Relating a pair costs more than all the rest, and it cannot have more inliers than common points. So a pair is related
-    only when no pair that could join the tree promises more, and is taken at once if nearly all its points are inliers.
+    To relate a pair is the expensive step. The number of common points is an upper bound for the number of inliers. So a pair
+    is related only if no other pair that could join the tree has a higher bound or count. A pair of which almost all points are
+    inliers joins the tree at once.
 
     Args:
-        common: (C, C), the number of points two cameras have in common.
-        relate: finds the relative poses of two cameras.
-        labels: the cameras' names, for messages.
-        min_common: fewest common points of a pair.
+        common: number of common points of each pair, (C, C).
+        relate: a function that estimates the relative poses of two cameras.
+        labels: names of the cameras, for error messages.
+        min_common: smallest number of inliers of an edge.
 
     Raises:
-        RigError: if some camera cannot be reached, naming it and the pairs that fell short.
+        RigError: if a camera cannot be connected. The message names it and the pairs with too few points.
     """
     cameras = range(len(labels))
     placed, edges, related = {0}, list[Edge](), dict[tuple[int, int], Pair]()
     while len(placed) < len(labels):
         crossing = [(i, j) for i in cameras for j in cameras if i < j and (i in placed) != (j in placed)]
-        promised = {pair: related[pair].inliers if pair in related else int(common[pair]) for pair in crossing}
-        best = max(crossing, key=lambda pair: promised[pair])
-        if promised[best] < min_common:
+        bounds = {pair: related[pair].inliers if pair in related else int(common[pair]) for pair in crossing}
+        best = max(crossing, key=lambda pair: bounds[pair])
+        if bounds[best] < min_common:
             raise _disconnected({pair: int(common[pair]) for pair in crossing}, placed, labels, min_common)
         if best not in related:
             related[best] = relate(*best)
-            if related[best].inliers < _NEARLY_ALL * related[best].common:
+            if related[best].inliers < _SUFFICIENT_INLIERS * related[best].common:
                 continue
         poses = related[best].poses
         if best[0] in placed:
@@ -66,32 +69,32 @@ def spanning_tree(
 
 
 def propagate(edges: Sequence[Edge], views: Views, scale: float) -> tuple[Array, Array]:
-    """Poses of all cameras, world to camera, in the frame of the first; the first edge has length 1.
+    """Rotations (C, 3, 3) and translations (C, 3) of all cameras, in the frame of the first. The first edge has length 1.
 
-    A pose out of an essential matrix is one of four, and the count of points in front of both cameras does not always
-    tell which: the twisted twin is told from the true one by a third camera, in which it projects the points elsewhere.
-    So the tree is grown from every plausible pose of the first edge, at each edge the pose is taken that the points
-    placed so far support best, and the tree with most support is returned. A few hundred points, spread over the session,
-    tell.
+    An essential matrix allows four poses. The number of points in front of both cameras does not always identify the true pose
+    among them: the twisted pair can have as many. A third camera decides, because the wrong pose projects the points elsewhere
+    in it. So the cameras are placed once for every plausible pose of the first edge. At each further edge, the pose with the
+    largest support by the points known so far is used. The rig with the largest total support is returned. A few hundred
+    points, evenly spaced in the session, are sufficient.
 
     Args:
-        edges: the tree, in order of growth.
-        views: what the cameras see.
-        scale: residual, in normalised coordinates, up to which a point supports a pose.
+        edges: the spanning tree.
+        views: the keypoints.
+        scale: scale of the robust kernel, in normalised image coordinates.
     """
     columns = np.flatnonzero(views.visible.any(0))
     rays, visible = views.rays(list(range(len(views.visible))), columns[spread(len(columns), _MAX_POINTS)])
     first = edges[0].poses
     plausible = [pose for pose in first if pose.in_front >= _PLAUSIBLE_SHARE * first[0].in_front]
-    trees = [_grow(root, edges, rays, visible, scale) for root in plausible]
-    _, rotations, translations = max(trees, key=lambda tree: tree[0])
+    rigs = [_place_cameras(root, edges, rays, visible, scale) for root in plausible]
+    _, rotations, translations = max(rigs, key=lambda rig: rig[0])
     return rotations, translations
 
 
-def _grow(
+def _place_cameras(
     root: RelativePose, edges: Sequence[Edge], rays: Array, visible: NDArray[np.bool_], scale: float
 ) -> tuple[float, Array, Array]:
-    """Support of the tree that starts with a pose of its first edge, and the poses of all cameras."""
+    """Total support, rotations and translations of the rig with a given pose of the first edge."""
     cameras = len(rays)
     rotations, translations = np.tile(np.eye(3), (cameras, 1, 1)), np.zeros((cameras, 3))
     rotations[edges[0].child], translations[edges[0].child] = root.rotation, root.translation
@@ -105,14 +108,14 @@ def _grow(
             torch.from_numpy(visible[placed]).double(),
             scale=scale,
         ).numpy()
-        candidates = [_attach(pose, edge, rotations, translations, known, rays, visible, scale) for pose in edge.poses]
-        gained, rotations[edge.child], translations[edge.child] = max(candidates, key=lambda c: c[0])
+        candidates = [_place_camera(pose, edge, rotations, translations, known, rays, visible, scale) for pose in edge.poses]
+        gained, rotations[edge.child], translations[edge.child] = max(candidates, key=lambda candidate: candidate[0])
         support += gained
         placed.append(edge.child)
     return support, rotations, translations
 
 
-def _attach(
+def _place_camera(
     pose: RelativePose,
     edge: Edge,
     rotations: Array,
@@ -122,7 +125,11 @@ def _attach(
     visible: NDArray[np.bool_],
     scale: float,
 ) -> tuple[float, Array, Array]:
-    """Support and pose of a camera placed from its parent, the baseline measured on points known already."""
+    """Support, rotation and translation of the child of an edge, for one relative pose.
+
+    The length of the baseline is the median ratio of the depths of known points to their depths for a baseline of length 1. The
+    support is the sum of the kernel weights of the known points that the child sees.
+    """
     parent, child = edge.parent, edge.child
     common = np.flatnonzero(visible[parent] & visible[child] & np.isfinite(known[0]))
     depth_known = rotations[parent, 2] @ known[:, common] + translations[parent, 2]
@@ -139,12 +146,12 @@ def _attach(
 
 
 def _disconnected(common: dict[tuple[int, int], int], placed: set[int], labels: Sequence[str], min_common: int) -> RigError:
-    cut_off = [label for index, label in enumerate(labels) if index not in placed]
-    counts = ", ".join(f"{labels[i]} and {labels[j]} share {count}" for (i, j), count in common.items())
+    isolated = [label for index, label in enumerate(labels) if index not in placed]
+    counts = ", ".join(f"{labels[i]} and {labels[j]} have {count} common points" for (i, j), count in common.items())
     return RigError(
         "cameras see too little in common to be placed in one rig",
         where="keypoints",
-        got=f"{', '.join(cut_off)} cut off; {counts}",
-        expected=f"at least {min_common} common points that fit one pose, between some pair",
-        remedy="Use a longer session in which the athlete crosses the views of these cameras, or leave them out.",
+        got=f"{', '.join(isolated)} not connected to the other cameras; {counts}",
+        expected=f"at least {min_common} common points that fit one relative pose, in one of these pairs",
+        remedy="Record a longer session in which these cameras and others see the athlete in the same frames, or remove them.",
     )

@@ -1,4 +1,4 @@
-"""Linear triangulation over all cameras that see a point, re-weighted against outliers."""
+"""Robust linear triangulation from all cameras that see a point."""
 
 from __future__ import annotations
 
@@ -13,20 +13,21 @@ _MIN_DEPTH = 1e-3
 def triangulate(
     rotations: Tensor, translations: Tensor, rays: Tensor, weights: Tensor, *, scale: float, iterations: int = 6
 ) -> Tensor:
-    """N-view DLT of N points, in its inhomogeneous form.
+    """N-view DLT (direct linear transform) of N points, in its inhomogeneous form.
 
-    Each view gives two equations that are linear in the point. From the second iteration on they are divided by the depth,
-    so that they measure distances in the image, and weighted down by Geman and McClure's kernel beyond ``scale``.
+    Each view gives two linear equations in the point. From the second iteration on, the equations are divided by the depth, so
+    that their residuals are distances in the image, and the views are weighted by the Geman-McClure kernel.
 
     Args:
-        rotations: (C, 3, 3) and translations: (C, 3), world to camera.
-        rays: undistorted, normalised coordinates (C, 2, N).
-        weights: (C, N), zero where a camera does not see the point.
-        scale: residual, in normalised coordinates, beyond which a view is taken for an outlier.
-        iterations: number of re-weightings.
+        rotations: (C, 3, 3), world to camera.
+        translations: (C, 3), world to camera.
+        rays: undistorted, normalised image coordinates, (C, 2, N).
+        weights: (C, N), zero if a camera does not see the point.
+        scale: scale of the kernel, in normalised image coordinates. Views with a much larger residual have little weight.
+        iterations: number of iterations.
 
     Returns:
-        (3, N); NaN at points with fewer than two views.
+        Points (3, N), NaN for points with fewer than two views.
     """
     u, v = rays.unbind(1)
     by_axis, offset = rotations.mT[..., None], translations[..., None]

@@ -1,4 +1,4 @@
-"""What each camera sees, as the initialisation looks at it: a sample of the points at a time, undistorted."""
+"""Undistorted keypoints of samples of the points, for the initialisation."""
 
 from __future__ import annotations
 
@@ -9,12 +9,13 @@ from torchstickcal.model.measurements import Measurements
 
 Array = NDArray[np.float64]
 
-_UNDISTORTED_AT_ONCE = 500_000
-"""Keypoints of a session up to which all are undistorted once, instead of each sample when it is looked at."""
+_MAX_CACHED_KEYPOINTS = 500_000
+"""Number of keypoints of a session up to which all are undistorted at once. In longer sessions each sample is undistorted when
+it is requested."""
 
 
 class Views:
-    """Access to the keypoints of a session without holding them twice.
+    """The keypoints of a session in normalised image coordinates, without a second copy of a long session.
 
     Args:
         measurements: one session.
@@ -26,20 +27,19 @@ class Views:
         """(C, N)"""
         self.focal_px: Array = measurements.cameras.focal_px[0].cpu().numpy()
         """(C,)"""
-        self._whole = self._undistorted(slice(None), slice(None)) if self.visible.size <= _UNDISTORTED_AT_ONCE else None
+        self._cache = self._undistorted(slice(None), slice(None)) if self.visible.size <= _MAX_CACHED_KEYPOINTS else None
 
     def common(self) -> NDArray[np.int_]:
-        """The number of points two cameras have in common, (C, C)."""
+        """Number of common points of each pair of cameras, (C, C)."""
         count = len(self.visible)
         return np.array([[np.count_nonzero(self.visible[i] & self.visible[j]) for j in range(count)] for i in range(count)])
 
     def rays(self, cameras: list[int], columns: NDArray[np.intp]) -> tuple[Array, NDArray[np.bool_]]:
-        """Normalised coordinates (c, 2, n) of some points in some cameras, and which of them are seen (c, n).
+        """Normalised image coordinates (c, 2, n) of n columns in c cameras, and which of them are seen (c, n).
 
-        A keypoint beyond the fold of its lens counts as not seen.
+        Keypoints that the distortion model cannot produce count as not seen.
         """
-        whole = self._whole
-        rays = self._undistorted(cameras, columns) if whole is None else whole[cameras][:, :, columns]
+        rays = self._undistorted(cameras, columns) if self._cache is None else self._cache[cameras][:, :, columns]
         return np.nan_to_num(rays), self.visible[cameras][:, columns] & np.isfinite(rays).all(1)
 
     def _undistorted(self, cameras: list[int] | slice, columns: NDArray[np.intp] | slice) -> Array:
@@ -49,5 +49,5 @@ class Views:
 
 
 def spread(count: int, limit: int) -> NDArray[np.intp]:
-    """At most ``limit`` of the indices below ``count``, evenly spread."""
+    """At most ``limit`` evenly spaced indices below ``count``."""
     return np.linspace(0, count - 1, min(limit, count)).astype(np.intp)

@@ -1,4 +1,4 @@
-"""Cameras whose clocks differ: their offsets from the motion itself, and sessions on a common frame axis."""
+"""Synchronisation of cameras: time offsets from the motion in the images, and sessions on common frames."""
 
 from __future__ import annotations
 

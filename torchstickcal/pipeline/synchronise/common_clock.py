@@ -1,4 +1,4 @@
-"""Keypoints of different exposure times, moved to common times by the motion found, and adjusted again until both agree."""
+"""Adjustment of cameras with different exposure times: move the keypoints to common times, adjust, and repeat."""
 
 from __future__ import annotations
 
@@ -14,47 +14,48 @@ from torchstickcal.pipeline.synchronise.exposure import Exposures, Support
 from torchstickcal.solvers import StageRecord
 
 CLOCK_STAGE = "clocks"
-"""Name of the stage when it is run again."""
+"""Name of the repeated stage in the records."""
 
 _MAX_ROUNDS = 10
 _MOVED_SHARE, _MOVED_SIGMAS = 0.9, 0.001
-"""The clocks have converged when this share of the keypoints has moved by less than so many standard deviations."""
+"""The iteration has converged when this share of the inliers moves by less than this many standard deviations."""
 
 
 def synchronise_keypoints(
-    seen: Measurements,
+    detected: Measurements,
     exposures: Exposures,
     measurements: Measurements,
     result: StageResult,
     run: Callable[[Measurements, State], StageResult],
 ) -> tuple[Measurements, StageResult, list[list[StageRecord]]]:
-    """Move the keypoints to the common frames and run a stage with them, as often as it takes.
+    """Move the keypoints to the common frames and run a stage with them, until the keypoints no longer move.
 
     Args:
-        seen: the keypoints as detected.
-        exposures: when they were exposed.
-        measurements: the keypoints with which the stage was run last.
-        result: where it ended.
-        run: runs the stage with other measurements, from a state.
+        detected: the keypoints as detected.
+        exposures: the exposure times of the keypoints.
+        measurements: the keypoints of the last run of the stage.
+        result: the result of that run.
+        run: a function that runs the stage with other measurements, from a state.
 
     Returns:
-        The keypoints on the common frames, where the stage ended with them, and its records for each session.
+        The keypoints on the common frames, the result of the stage with them, and the records of the repeated stage for each
+        session.
     """
     support = _support(measurements, result)
-    going = torch.ones(seen.sessions, dtype=torch.bool, device=seen.pixels.device)
-    records: list[list[StageRecord]] = [[] for _ in range(seen.sessions)]
+    unfinished = torch.ones(detected.sessions, dtype=torch.bool, device=detected.pixels.device)
+    records: list[list[StageRecord]] = [[] for _ in range(detected.sessions)]
     for number in range(_MAX_ROUNDS):
-        moved = exposures.on_common_frames(seen, result.state, support)
+        moved = exposures.on_common_frames(detected, result.state, support)
         if number > 0:
-            going = _have_moved(moved, measurements, result)
+            unfinished = _have_moved(moved, measurements, result)
         measurements = moved
-        if not bool(going.any()):
+        if not bool(unfinished.any()):
             break
-        again = run(moved, result.state)
-        for own, record, still_going in zip(records, again.records, going.tolist(), strict=True):
-            own.extend([record] if still_going else [])
-        result = result.replaced(going, again)
-        support = support.replaced(going, _support(moved, result))
+        repeated = run(moved, result.state)
+        for session, record, continued in zip(records, repeated.records, unfinished.tolist(), strict=True):
+            session.extend([record] if continued else [])
+        result = result.replaced(unfinished, repeated)
+        support = support.replaced(unfinished, _support(moved, result))
     return measurements, result, records
 
 
@@ -63,7 +64,7 @@ def _support(measurements: Measurements, result: StageResult) -> Support:
 
 
 def _have_moved(now: Measurements, before: Measurements, result: StageResult) -> Tensor:
-    """Whether the keypoints of a session (B,) are elsewhere than before."""
-    moved = (now.pixels_at(result.state) - before.pixels_at(result.state)).square().sum(-2).sqrt()
-    still = before.by_frame(moved) < _MOVED_SIGMAS * result.sigma_px[:, None, None]
-    return (still.flatten(2) & result.inliers).sum((1, 2)) < _MOVED_SHARE * result.inliers.sum((1, 2))
+    """Whether the keypoints of a session have moved noticeably, (B,)."""
+    distance = (now.pixels_at(result.state) - before.pixels_at(result.state)).square().sum(-2).sqrt()
+    unmoved = before.by_frame(distance) < _MOVED_SIGMAS * result.sigma_px[:, None, None]
+    return (unmoved.flatten(2) & result.inliers).sum((1, 2)) < _MOVED_SHARE * result.inliers.sum((1, 2))

@@ -1,7 +1,8 @@
-"""Keypoints moved to the common frames: each by as much as its point moves in the image between its exposure and the frame.
+"""Keypoints moved to the common frames: each by the motion of its point in the image between the exposure and the frame.
 
-The motion is taken from the trajectories of the estimated points, not from the keypoints, whose noise would look like motion.
-So clocks are estimated like lenses, by columns of the camera system, and the trajectories are renewed after each adjustment.
+The motion follows from the trajectories of the estimated points. The keypoints themselves are too noisy to estimate it. So
+clocks can be estimated like lenses, as further unknowns of the camera system. The trajectories are updated after each
+adjustment.
 """
 
 from __future__ import annotations
@@ -23,10 +24,10 @@ from torchstickcal.solvers.uncertainty import point_variances
 
 
 class Support(NamedTuple):
-    """How well the points of B sessions are known."""
+    """The uncertainty of the points of B sessions."""
 
     variance: Tensor
-    """(B, N), of a point along an axis, square metres; infinite where it is not known"""
+    """(B, N), variance of a point along an axis, square metres; infinite for unknown points"""
     views: Tensor
     """(B, N), number of cameras that see a point"""
     sigma_px: Tensor
@@ -34,21 +35,21 @@ class Support(NamedTuple):
 
     @staticmethod
     def of(measurements: Measurements, state: State, sigma_px: Tensor) -> Support:
-        """From the measurements that took part, at a state, with the noise (B, P) of each point's keypoints."""
+        """The uncertainty of the points, from the inliers, the state and the noise (B, P) of each point's keypoints."""
         return Support(point_variances(measurements, state, sigma_px), measurements.visible.sum(1), sigma_px)
 
     def replaced(self, where: Tensor, other: Support) -> Support:
-        """The same with some sessions (B,), True where, taken from another."""
+        """A copy with the values of another for the sessions in which ``where`` (B,) is True."""
         return Support(*(torch.where(where[:, None], new, old) for old, new in zip(self, other, strict=True)))
 
 
 @dataclass(frozen=True)
 class Exposures:
-    """When the keypoints of B sessions were exposed.
+    """The exposure times of the keypoints of B sessions.
 
     Args:
-        delays: (B, C, N), given time from the common frame to the exposure, in frames.
-        rows: (B, C, N), distance below the middle row as a fraction of the image height; zero where the size is not known.
+        delays: time from the common frame to the exposure, by timestamps and given read-out time, (B, C, N), frames.
+        rows: distance below the middle row of the image as a fraction of the image height, (B, C, N); zero without image size.
     """
 
     delays: Tensor
@@ -56,7 +57,12 @@ class Exposures:
 
     @staticmethod
     def of(frames: CommonFrames, window: slice = slice(None)) -> Exposures:
-        """Exposures of a session on its common frames, or on some of them, by its timestamps and read-out time."""
+        """The exposure times of one session.
+
+        Args:
+            frames: the session on its common frames.
+            window: the common frames to use.
+        """
         observations = frames.observations
         ordinates = observations.keypoints[:, window, :, 1].double()
         rows = torch.zeros_like(ordinates)
@@ -70,39 +76,43 @@ class Exposures:
 
     @staticmethod
     def stack(sessions: Sequence[Exposures]) -> Exposures:
-        """Exposures of several sessions as one batch."""
+        """The exposure times of several sessions as one batch."""
         return Exposures(torch.cat([s.delays for s in sessions]), torch.cat([s.rows for s in sessions]))
 
     def unmoved(self, measurements: Measurements) -> Measurements:
-        """Measurements with unknown clocks, as if nothing moved: as long as there are no trajectories."""
-        still = torch.zeros_like(measurements.pixels)
-        return replace(measurements, motion=self._motion(still, measurements.unknowns.given))
+        """Measurements with unknown clocks and zero motion, for the time before there are trajectories."""
+        velocity = torch.zeros_like(measurements.pixels)
+        return replace(measurements, motion=self._motion(velocity, measurements.unknowns.given))
 
     def on_common_frames(self, measurements: Measurements, state: State, support: Support) -> Measurements:
-        """Measurements with the keypoints moved to the common frames, and less weight where the motion in between is not known.
+        """Measurements with the keypoints moved to the common frames.
+
+        The error of the interpolation lowers the confidence of a keypoint.
 
         Args:
             measurements: the keypoints as detected.
-            state: cameras, points and unknowns that say where the keypoints move.
-            support: how well the points are known.
+            state: cameras, points and unknowns, which determine the motion of the keypoints.
+            support: the uncertainty of the points.
         """
         m = measurements
         delays = self.delays + m.unknowns.delays(self.rows, state.unknowns)
-        every_camera = m.cameras_at(state).to(torch.float64)
+        intrinsics = m.cameras_at(state).to(torch.float64)
         pixels, velocity, confidence = m.pixels.clone(), torch.empty_like(m.pixels), m.confidence.clone()
         for session in range(m.sessions):
             tracks = (m.by_frame(of_points[session]) for of_points in (state.points, support.variance, support.views))
             trajectories = Trajectories(*tracks)
-            cameras, pose = every_camera[session], (state.rotations[session], state.translations[session])
+            cameras, poses = intrinsics[session], (state.rotations[session], state.translations[session])
             for columns, frames in zip(m.chunks(), m.frame_slices(), strict=True):
-                pieces, delay = trajectories.pieces(frames), delays[session, :, columns]
-                exposed, depth, moving = _seen(cameras, pose, pieces.positions(delay), pieces.velocities(delay))
-                x, y, z = _in_cameras(pose, pieces.positions(torch.zeros_like(delay))).unbind(1)
-                moved = exposed - torch.stack(cameras.project_components(x, y, z), dim=1)
-                pixels[session, ..., columns] -= moved.where(((depth > 0) & (z > 0))[:, None], 0.0).to(pixels.dtype)
-                velocity[session, ..., columns] = moving.where((depth > 0)[:, None], 0.0).to(pixels.dtype)
-                deviation = pieces.deviations_m(delay) * cameras.focal_px[:, None] * depth
-                variance_ratio = (deviation / support.sigma_px[session].repeat(frames.stop - frames.start)).square()
+                polynomials, delay = trajectories.polynomials(frames), delays[session, :, columns]
+                points, velocities = polynomials.positions(delay), polynomials.velocities(delay)
+                at_exposure, inverse_depth, image_velocity = _project_moving(cameras, poses, points, velocities)
+                x, y, z = _to_cameras(poses, polynomials.positions(torch.zeros_like(delay))).unbind(1)
+                shift = at_exposure - torch.stack(cameras.project_components(x, y, z), dim=1)
+                in_front = inverse_depth > 0
+                pixels[session, ..., columns] -= shift.where((in_front & (z > 0))[:, None], 0.0).to(pixels.dtype)
+                velocity[session, ..., columns] = image_velocity.where(in_front[:, None], 0.0).to(pixels.dtype)
+                std_px = polynomials.interpolation_std_m(delay) * cameras.focal_px[:, None] * inverse_depth
+                variance_ratio = (std_px / support.sigma_px[session].repeat(frames.stop - frames.start)).square()
                 weights = confidence[session, :, columns]
                 weights /= 1 + weights * variance_ratio.to(pixels.dtype)
         return replace(m, pixels=pixels, confidence=confidence, motion=self._motion(velocity, state.unknowns))
@@ -111,19 +121,29 @@ class Exposures:
         return ImageMotion(velocity, self.rows.to(velocity), reference)
 
 
-def _seen(
-    cameras: Intrinsics, pose: tuple[Tensor, Tensor], points: Tensor, velocities: Tensor
+def _project_moving(
+    cameras: Intrinsics, poses: tuple[Tensor, Tensor], points: Tensor, velocities: Tensor
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Pixels (C, 2, n) of points (C, 3, n) that have velocities, their inverse depths (C, n), and velocities in the image."""
-    x, y, z = _in_cameras(pose, points).unbind(1)
+    """Projections of moving points.
+
+    Args:
+        cameras: C cameras.
+        poses: rotations (C, 3, 3) and translations (C, 3), world to camera.
+        points: each camera's own points in the world, (C, 3, n), metres.
+        velocities: (C, 3, n), metres per frame.
+
+    Returns:
+        Pixels (C, 2, n), inverse depths (C, n), and velocities in the image (C, 2, n), pixels per frame.
+    """
+    x, y, z = _to_cameras(poses, points).unbind(1)
     inverse_depth = inverse_depths(z)
     u, v = x * inverse_depth, y * inverse_depth
-    m = cameras.pixels_with_jacobian(u, v)
-    moving = torch.stack(m.moved(u, v, inverse_depth, pose[0] @ velocities), dim=1)
-    return torch.stack([m.x, m.y], dim=1), inverse_depth, moving
+    projection = cameras.pixels_with_jacobian(u, v)
+    image_velocity = torch.stack(projection.moved(u, v, inverse_depth, poses[0] @ velocities), dim=1)
+    return torch.stack([projection.x, projection.y], dim=1), inverse_depth, image_velocity
 
 
-def _in_cameras(pose: tuple[Tensor, Tensor], points: Tensor) -> Tensor:
-    """Points (C, 3, n) of the world, each camera's own, in the cameras' frames."""
-    rotations, translations = pose
+def _to_cameras(poses: tuple[Tensor, Tensor], points: Tensor) -> Tensor:
+    """Each camera's own points (C, 3, n), from the world to the camera."""
+    rotations, translations = poses
     return rotations @ points + translations[..., None]

@@ -1,4 +1,4 @@
-"""Sessions on a common frame axis, whatever the cameras' clocks, frame rates and dropped frames."""
+"""Sessions on common frames, for cameras with different clocks, different frame rates or dropped frames."""
 
 from __future__ import annotations
 
@@ -13,33 +13,33 @@ from torchstickcal.observations import Observations
 
 @dataclass(frozen=True, eq=False)
 class CommonFrames:
-    """A session whose cameras' frames stand beside each other: frame g of all cameras was exposed at about the same time.
+    """A session in which frame g of all cameras was exposed at about the same time.
 
-    Common frames are those of camera 0's clock, from its time 0 on. G of them are kept, from the first that two cameras have
-    to the last.
+    Common frame g is at time g on the clock of camera 0, in frames. Of all common frames, G are kept: from the first to the
+    last that at least two cameras have.
     """
 
     observations: Observations
-    """the session on the common frames, NaN where a camera has none"""
+    """the session on the common frames; NaN where a camera has no frame"""
     index: Tensor
-    """(C, F), the place of each camera's own frames among the common ones; -1 where it has none"""
+    """(C, F), the common frame (of G) of each camera's own frames; -1 for frames without one"""
     lags: Tensor
-    """(C, G), float64: how much later than the common frame a camera's frame begins, frames; 0 where it has none"""
+    """(C, G), float64, time from a common frame to the start of the camera's frame, in frames; 0 where it has no frame"""
     offsets_frames: Tensor
-    """(C,), float64, how much later than told the cameras' frames are taken to begin, frames"""
+    """(C,), float64, time offsets that were added to the cameras' timestamps or frame numbers, in frames"""
     first: int
-    """the common frame that is kept first"""
+    """number of the first common frame that is kept"""
     rate_hz: float | None
-    """common frames per second; None where that is not known"""
+    """common frames per second; None if unknown"""
 
     @property
     def apart(self) -> bool:
-        """Whether keypoints at one common frame were not all exposed together, as far as that was told."""
+        """Whether the keypoints of a common frame have different exposure times, by timestamps, offsets and read-out time."""
         return bool((self.lags != 0).any()) or bool(self.observations.readout_s)
 
     def to_own(self, values: Tensor, fill: float) -> Tensor:
-        """Values (C, G, ...) of the common frames at the cameras' own frames, (C, F, ...)."""
-        if _in_place(self.index):
+        """Values (C, F, ...) for the cameras' own frames, from values (C, G, ...) for the common frames."""
+        if _is_identity(self.index):
             return values
         cameras = torch.arange(len(self.index), device=self.index.device)[:, None]
         missing = (self.index < 0).view(*self.index.shape, *[1] * (values.ndim - 2))
@@ -47,50 +47,50 @@ class CommonFrames:
 
 
 def on_common_frames(observations: Observations, offsets_frames: Tensor | None = None) -> CommonFrames:
-    """A session on common frames, every camera's frame at the nearest one.
+    """Assign each frame of each camera to the nearest common frame.
 
     Args:
         observations: the session.
-        offsets_frames: (C,), how much later than reckoned camera c's frames begin, common frames; None for not at all.
+        offsets_frames: time offsets to add to the cameras' timestamps or frame numbers, (C,), in common frames; None for zero.
 
     Raises:
-        ObservationError: if no two cameras have a frame in common, or the stick is never seen by two cameras there.
+        ObservationError: if no two cameras have a frame in common, or no two of them see the stick there.
     """
-    rate, begins = _begins(observations)
-    offsets = begins.new_zeros(len(begins)) if offsets_frames is None else offsets_frames.to(begins)
-    begins = begins + offsets[:, None]
-    exists = begins.isfinite()
-    common = (begins.nan_to_num() + 0.5).floor().long()
-    starts = torch.where(exists, common, torch.iinfo(torch.long).max).amin(1).sort().values
-    ends = torch.where(exists, common, torch.iinfo(torch.long).min).amax(1).sort().values
-    first, last = int(starts[1]), int(ends[-2])
+    rate, starts = _frame_starts(observations)
+    offsets = starts.new_zeros(len(starts)) if offsets_frames is None else offsets_frames.to(starts)
+    starts = starts + offsets[:, None]
+    exists = starts.isfinite()
+    nearest = (starts.nan_to_num() + 0.5).floor().long()
+    firsts = torch.where(exists, nearest, torch.iinfo(torch.long).max).amin(1).sort().values
+    lasts = torch.where(exists, nearest, torch.iinfo(torch.long).min).amax(1).sort().values
+    first, last = int(firsts[1]), int(lasts[-2])
     if last < first:
         raise ObservationError(
             "no two cameras have a frame in common",
             where="timestamps" if observations.timestamps is not None else "offsets_frames",
-            got=f"cameras' first frames {starts.tolist()}, last frames {ends.tolist()}",
-            expected="times that overlap",
-            remedy="Timestamps count from a moment that the cameras share, at least roughly.",
+            got=f"first frames of the cameras {firsts.tolist()}, last frames {lasts.tolist()}, both sorted",
+            expected="at least two cameras whose times overlap",
+            remedy="Check that the times of all cameras count from about the same moment.",
         )
-    lags = begins.nan_to_num() - common
-    index = torch.where(exists & (common >= first) & (common <= last), common - first, -1)
-    index = _nearest(index, lags, last - first + 1)
-    if _in_place(index):
+    lags = starts.nan_to_num() - nearest
+    index = torch.where(exists & (nearest >= first) & (nearest <= last), nearest - first, -1)
+    index = _without_duplicates(index, lags, last - first + 1)
+    if _is_identity(index):
         return CommonFrames(observations, index, lags, offsets, first, rate)
-    placed = _Placed(index, last - first + 1)
+    to_common = _ToCommonFrames(index, last - first + 1)
     confidence = observations.confidence
-    moved = replace(
+    on_common = replace(
         observations,
-        keypoints=placed(observations.keypoints, torch.nan),
-        confidence=None if confidence is None else placed(confidence, 0.0),
+        keypoints=to_common(observations.keypoints, torch.nan),
+        confidence=None if confidence is None else to_common(confidence, 0.0),
         timestamps=None,
         fps=rate,
     )
-    return CommonFrames(moved, index, placed(lags, 0.0), offsets, first, rate)
+    return CommonFrames(on_common, index, to_common(lags, 0.0), offsets, first, rate)
 
 
-def _begins(observations: Observations) -> tuple[float | None, Tensor]:
-    """Common frames per second, and when every frame (C, F) begins, in common frames; NaN where a camera has no frame."""
+def _frame_starts(observations: Observations) -> tuple[float | None, Tensor]:
+    """Common frames per second, and the start of each frame (C, F) in common frames; NaN where a camera has no frame."""
     times = observations.timestamps
     if times is None:
         frames = torch.arange(observations.num_frames, dtype=torch.float64, device=observations.keypoints.device)
@@ -99,27 +99,32 @@ def _begins(observations: Observations) -> tuple[float | None, Tensor]:
     return rate, times.double() * rate
 
 
-def _in_place(index: Tensor) -> bool:
-    """Whether every camera's own frames are the common ones."""
+def _is_identity(index: Tensor) -> bool:
+    """Whether each camera's own frames are the common frames."""
     return torch.equal(index, torch.arange(index.shape[1], device=index.device).expand_as(index))
 
 
-def _nearest(index: Tensor, lags: Tensor, frames: int) -> Tensor:
-    """Places (C, F) with -1 for those of several frames at one common frame that are further from it."""
-    cost = torch.where(index >= 0, lags.abs(), torch.inf)
-    best = lags.new_full((len(index), frames), torch.inf).scatter_reduce(1, index.clamp_min(0), cost, "amin")
-    return torch.where(cost <= best.gather(1, index.clamp_min(0)), index, -1)
+def _without_duplicates(index: Tensor, lags: Tensor, frames: int) -> Tensor:
+    """The index (C, F) with one frame per camera and common frame: the others, with larger lags, are set to -1."""
+    distance = torch.where(index >= 0, lags.abs(), torch.inf)
+    smallest = lags.new_full((len(index), frames), torch.inf).scatter_reduce(1, index.clamp_min(0), distance, "amin")
+    return torch.where(distance <= smallest.gather(1, index.clamp_min(0)), index, -1)
 
 
 @dataclass(frozen=True)
-class _Placed:
-    """Moves values (C, F, ...) of the cameras' own frames to the common ones (C, G, ...)."""
+class _ToCommonFrames:
+    """Moves values (C, F, ...) from the cameras' own frames to the common frames, (C, G, ...).
+
+    Args:
+        index: the common frame of each own frame, (C, F), or -1.
+        frames: G.
+    """
 
     index: Tensor
     frames: int
 
     def __call__(self, values: Tensor, fill: float) -> Tensor:
-        placed = values.new_full((len(values), self.frames, *values.shape[2:]), fill)
+        common = values.new_full((len(values), self.frames, *values.shape[2:]), fill)
         cameras, own = (self.index >= 0).nonzero(as_tuple=True)
-        placed[cameras, self.index[cameras, own]] = values[cameras, own]
-        return placed
+        common[cameras, self.index[cameras, own]] = values[cameras, own]
+        return common

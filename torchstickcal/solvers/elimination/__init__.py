@@ -1,1 +1,1 @@
-"""Exact elimination of the points (Schur complement), so that a solver sees a small dense system in the cameras."""
+"""Exact elimination of the points by the Schur complement. A small dense system in the cameras remains."""

@@ -1,7 +1,10 @@
-"""The coupling H_xc of points with cameras, ``N B(X)`` with ``B(X) = [I, -[X]x]``: three columns of N, three derived.
+"""Blocks H_xc of the Hessian between points and cameras: ``H_xc = N_c B(X)`` with ``B(X) = [I, -[X]x]``.
 
-Blocks N are symmetric and stored as their six distinct entries xx xy xz yy yz zz; rows are laid out (camera, tangent, axis of
-the point, column), so that a camera's tangent is a row of the matrix that is multiplied with itself.
+N_c is the 3 x 3 Hessian block of camera c with respect to the point X. The three translation columns of H_xc are N_c itself,
+and the three rotation columns follow from them.
+
+N_c is stored as its six distinct entries xx xy xz yy yz zz. The result is stored transposed, as rows (camera, tangent, axis of
+the point, column), because the Schur complement multiplies these rows with each other.
 """
 
 from __future__ import annotations
@@ -11,17 +14,17 @@ from torch import Tensor
 
 
 def cross_rows(blocks: Tensor, points: Tensor) -> Tensor:
-    """``(N B(X))^T`` as (B, C', 6, 3, n), for blocks (B, C', 6, n) and points (B, 3, n)."""
+    """``H_xc^T = (N_c B(X))^T`` as (B, C', 6, 3, n), for blocks N_c (B, C', 6, n) and points (B, 3, n)."""
     rows = blocks.new_empty(*blocks.shape[:2], 6, 3, blocks.shape[-1])
     rows[:, :, :3, 0] = blocks[:, :, :3]
     rows[:, :, 0, 1], rows[:, :, 1:3, 1] = blocks[:, :, 1], blocks[:, :, 3:5]
     rows[:, :, 0, 2], rows[:, :, 1:3, 2] = blocks[:, :, 2], blocks[:, :, 4:]
-    add_rotations(rows, points)
+    add_rotation_rows(rows, points)
     return rows
 
 
-def add_rotations(rows: Tensor, points: Tensor) -> None:
-    """Fill in the rotations' rows (B, C', 3:6, 3, n) of the translations' rows: columns of A, to those of ``-A [X]x``."""
+def add_rotation_rows(rows: Tensor, points: Tensor) -> None:
+    """Fill the rotation rows (B, C', 3:6, 3, n) from the translation rows A^T: they are the columns of ``-A [X]x``."""
     x, y, z = points[:, None, None].unbind(-2)
     a, b, c = rows[:, :, :3].unbind(2)
     torch.mul(c, y, out=rows[:, :, 3]).addcmul_(b, z, value=-1)
@@ -29,10 +32,11 @@ def add_rotations(rows: Tensor, points: Tensor) -> None:
     torch.mul(b, x, out=rows[:, :, 5]).addcmul_(a, y, value=-1)
 
 
-def twist_rows(gradients: Tensor) -> Tensor:
-    """What the exact Hessian adds to the rotations' rows, ``[g]x^T`` as (B, C', 3, 3, n), for gradients (B, C', 3, n).
+def rotation_curvature_rows(gradients: Tensor) -> Tensor:
+    """Addition of the exact Hessian to the rotation rows: ``[g]x^T`` as (B, C', 3, 3, n), for gradients g (B, C', 3, n).
 
-    A step of a camera turns the point it sees about the world's origin: ``g . (omega x X)`` has the mixed derivative ``[g]x``.
+    A rotation step omega of a camera moves the point X by ``omega x X``. So ``g . (omega x X)`` has the mixed second derivative
+    ``[g]x``.
     """
     x, y, z = gradients.unbind(2)
     zero = torch.zeros_like(x)

@@ -1,13 +1,19 @@
-"""The Gauss-Newton system of an objective, reduced to the cameras by exact elimination of the structure.
+"""The Gauss-Newton system of an objective, reduced to the cameras by exact elimination of the points.
 
-With the world-side perturbation ``T <- T Exp(delta)`` the derivative of a projection by its camera is its derivative by
-the point times ``B(X) = [I, -[X]x]``, the same for all cameras. So everything follows from one 3 x 3 block N and one
-gradient g per camera and point: H_xx = sum_c N_c, H_xc = N_c B, H_cc = sum B^T N_c B. With H_xx = L L^T and W = L^-1 H_xc
-the reduced camera system is S = H_cc - W^T W. What else is unknown of the cameras, lenses and clocks, joins them in that system
-as further columns of W.
+Poses are perturbed on the world side, ``T <- T Exp(delta)``. The derivative of a projection with respect to its
+camera is then its derivative with respect to the point times ``B(X) = [I, -[X]x]``, with the same B for all cameras. So one
+3 x 3 block N_c and one gradient g_c per camera and point are sufficient:
 
-One pass over the parts of the structure builds a part's blocks, eliminates it and adds its share to S while all of it is in
-the cache. What the back-substitution needs again is kept where it is small, and computed again where it is not.
+    H_xx = sum_c N_c        H_xc = N_c B        H_cc = sum_points B^T N_c B
+
+With H_xx = L L^T and W = L^-1 H_xc the reduced camera system (Schur complement) is S = H_cc - W^T W. Lens and clock unknowns
+are further columns of W.
+
+The points are divided into parts that no loss couples. One pass over the parts linearises a part, eliminates it, and adds its
+share to S, while its arrays are in the cache. The back-substitution needs the blocks of each part again. They are cached if
+they are small, and otherwise computed again.
+
+Hessians and gradients are halves of the derivatives of the cost, since a cost is a sum of squares.
 """
 
 from __future__ import annotations
@@ -33,84 +39,86 @@ from torchstickcal.solvers.elimination.parts import BetweenFrames, Couplings, Pa
 from torchstickcal.solvers.elimination.points import PointElimination
 from torchstickcal.solvers.elimination.tracks import TrackElimination
 
-_KEPT_BYTES = 2**28
-"""Size of the blocks N_c up to which they are kept for the back-substitution."""
+_MAX_CACHED_BYTES = 2**28
+"""Memory up to which the blocks N_c are cached for the back-substitution."""
 
 
 class Step(NamedTuple):
-    """A step of the unknowns and the decrease of the cost that the quadratic model promises for it, for B sessions."""
+    """A Levenberg-Marquardt step s of B sessions, ``(H + lambda D) s = -g`` with D the diagonal of H."""
 
     cameras: Tensor
-    """(B, C - 1, 6) tangents, (B, 0, 6) where the cameras are held"""
+    """(B, C - 1, 6) tangents; (B, 0, 6) if the cameras are held fixed"""
     points: Tensor
     """(B, 3, N), metres"""
     unknowns: Tensor
-    """(B, K), (B, 0) where there are none or the cameras are held"""
+    """(B, K); (B, 0) without lens and clock unknowns, and if the cameras are held fixed"""
     solved: Tensor
-    """(B,), False where the damped system is not positive definite and the step is worthless"""
+    """(B,), False if the damped system is not positive definite. The step is then invalid."""
     predicted_decrease: Tensor
-    """(B,)"""
-    leash: Tensor
-    """(B,), share of the descent that damping holds back, 0 to 1: near 1 the step is short because it is damped"""
+    """(B,), decrease of the cost that the quadratic model predicts"""
+    damped_share: Tensor
+    """(B,), ``lambda s^T D s / -g^T s``, from 0 to 1. Near 1, the damping is what makes the step short."""
     camera_sigmas: Tensor
-    """(B,), length of the cameras' step in standard deviations of their estimate; infinite where they are held"""
+    """(B,), length of the cameras' step in standard deviations of the cameras; infinite if they are held fixed"""
 
 
-class _Coupled(NamedTuple):
-    """What ties points to the cameras."""
+class _CameraCoupling(NamedTuple):
+    """What couples n columns with the cameras."""
 
-    cross: Tensor
+    camera_blocks: Tensor
     """(B, C', 6, n), the blocks N_c"""
-    twist: Tensor | None
-    """(B, C', 3, n), the cameras' gradients, where the Hessian is exact"""
-    coupling: Tensor | None
-    """(B, K, 3, n), the blocks with the cameras' further unknowns"""
+    camera_gradients: Tensor | None
+    """(B, C', 3, n), the gradients g_c, for the exact Hessian; None for the Gauss-Newton Hessian"""
+    unknown_blocks: Tensor | None
+    """(B, K, 3, n), the blocks between the points and the lens and clock unknowns; None without such unknowns"""
 
 
-class _Eliminated(NamedTuple):
-    """A part with its coupling to the cameras, as of :class:`_Coupled`, and the factor of its own Hessian."""
+class _EliminatedPart(NamedTuple):
+    """A part: its coupling with the cameras and the factor of its Hessian."""
 
-    cross: Tensor
-    twist: Tensor | None
-    coupling: Tensor | None
+    coupling: _CameraCoupling
     elimination: PointElimination | TrackElimination
 
-    def reductions(self, points: Tensor, gradient: Tensor) -> tuple[Tensor, Tensor]:
-        """Those of the elimination, at points and for a gradient (B, 3, n)."""
-        return self.elimination.reductions(self.cross, points, gradient, self.twist, self.coupling)
+    def forward_solve_cross(self, points: Tensor, gradient: Tensor) -> tuple[Tensor, Tensor]:
+        """``(L^-1 H_xc)^T`` and ``L^-1 g``, for points and a gradient (B, 3, n)."""
+        camera_blocks, camera_gradients, unknown_blocks = self.coupling
+        return self.elimination.forward_solve_cross(camera_blocks, points, gradient, camera_gradients, unknown_blocks)
 
-    def carried(self, points: Tensor, camera_step: Tensor, unknown_step: Tensor) -> Tensor:
-        """``H_xc`` times a step (B, C', 6) of the cameras and (B, K) of their further unknowns, (B, 3, n)."""
-        turns = se3.hat(camera_step[..., 3:])
-        moved = symmetric_times(self.cross, se3.moved(turns, camera_step[..., :3], points).to(self.cross.dtype))
-        if self.twist is not None:
-            moved = moved - (turns.to(moved.dtype) @ self.twist).sum(1)
-        if self.coupling is not None:
-            moved = moved + torch.einsum("bj,bjan->ban", unknown_step.to(moved.dtype), self.coupling)
-        return moved
+    def cross_product(self, points: Tensor, camera_step: Tensor, unknown_step: Tensor) -> Tensor:
+        """``H_xc`` times a step of the cameras, (B, C', 6), and of the lens and clock unknowns, (B, K): (B, 3, n)."""
+        camera_blocks, camera_gradients, unknown_blocks = self.coupling
+        rotation = se3.hat(camera_step[..., 3:])
+        moved = se3.moved(rotation, camera_step[..., :3], points)
+        product = symmetric_times(camera_blocks, moved.to(camera_blocks.dtype))
+        if camera_gradients is not None:
+            product = product - (rotation.to(product.dtype) @ camera_gradients).sum(1)
+        if unknown_blocks is not None:
+            product = product + torch.einsum("bj,bjan->ban", unknown_step.to(product.dtype), unknown_blocks)
+        return product
 
 
 class NormalEquations:
-    """The system of B sessions at one state.
+    """The Gauss-Newton system of B sessions at a state.
 
-    C' is the number of cameras solved for (all but the first, or none), K that of their further unknowns (none where they are
-    held).
+    C' is the number of free cameras: all but the first, or none. K is the number of lens and clock unknowns, 0 if the cameras
+    are held fixed.
 
     Args:
-        objective: the losses on their sessions.
-        state: where.
-        cameras_free: whether the cameras are unknowns; the first one never is.
-        damping: factor by which the diagonal of the Hessian is raised, one number or one per session (B,).
-        exact: whether the Hessian is the exact one, with the curvature of kernels, projections and lengths, instead of Gauss
-            and Newton's (track losses have to be quadratic). It need not be definite anywhere but at a minimum.
+        objective: the losses and measurements.
+        state: where to linearise.
+        cameras_free: whether the cameras are unknowns. The first camera never is.
+        damping: lambda. The diagonal of the Hessian is multiplied by 1 + lambda. One number, or one per session (B,).
+        exact: whether to use the exact Hessian instead of the Gauss-Newton approximation. It includes the second derivatives of
+            robust kernels, projections and lengths. Track losses must be quadratic. The exact Hessian need not be positive
+            definite except at a minimum.
     """
 
     terms: dict[str, Tensor]
     """value of each loss, (B,)"""
     reprojection_px: Tensor
-    """(B, C), weighted root mean square of the reprojection residuals"""
+    """(B, C), weighted root mean square reprojection error"""
     point_hessian: Tensor
-    """(B, 6, N), diagonal blocks H_xx, undamped"""
+    """(B, 6, N), diagonal blocks of H_xx, without damping"""
     point_gradient: Tensor
     """(B, 3, N)"""
     camera_gradient: Tensor
@@ -120,7 +128,7 @@ class NormalEquations:
     reduced: Tensor
     """(B, 6 C' + K, 6 C' + K), the reduced camera system S"""
     reduced_gradient: Tensor
-    """(B, 6 C' + K), the gradient that is left for the cameras once the points follow them"""
+    """(B, 6 C' + K), the right-hand side of the reduced camera system: g_c - H_cx H_xx^-1 g_x"""
 
     def __init__(
         self,
@@ -133,14 +141,13 @@ class NormalEquations:
         m = objective.measurements
         self._exact = exact
         self.objective, self.state = objective, state
-        self._count = m.num_cameras - 1 if cameras_free else 0
+        self._free_cameras = m.num_cameras - 1 if cameras_free else 0
         self._unknowns = m.unknowns if cameras_free else RigUnknowns.of((), m.cameras)
         self._damping = torch.as_tensor(damping, dtype=torch.float64, device=state.points.device).expand(m.sessions)
         self.terms = {name: state.points.new_zeros(m.sessions) for name in objective.losses}
-        self._add_structure()
-        self._parts = parts(m, objective.clusters, self._couplings)
-        self._kept: list[_Eliminated] | None = None
-        self._add_keypoints()
+        self._parts = parts(m, objective.clusters, self._add_point_losses())
+        self._cache: list[_EliminatedPart] | None = None
+        self._add_camera_point_losses()
 
     @property
     def cost(self) -> Tensor:
@@ -153,70 +160,79 @@ class NormalEquations:
         factor, failed = torch.linalg.cholesky_ex(self.reduced)
         camera_step, unknown_step = self._split(-torch.cholesky_solve(self.reduced_gradient[..., None], factor)[..., 0])
         point_step = torch.empty_like(gradient)
-        together = torch.cat([camera_step.flatten(1), unknown_step], dim=1)
-        descent = -(torch.cat([self.camera_gradient.flatten(1), self.unknown_gradient], dim=1) * together).sum(1)
-        held = (self._diagonal * together.square()).sum(1)
-        for part, eliminated in self._eliminations():
+        rig_step = torch.cat([camera_step.flatten(1), unknown_step], dim=1)
+        rig_gradient = torch.cat([self.camera_gradient.flatten(1), self.unknown_gradient], dim=1)
+        descent = -(rig_gradient * rig_step).sum(1)
+        squared = (self._rig_diagonal * rig_step.square()).sum(1)
+        for part, eliminated in self._eliminated_parts():
             rhs = gradient[..., part.columns]
-            carried = eliminated.carried(self.state.points[..., part.columns], camera_step, unknown_step)
-            solved = eliminated.elimination.solve(rhs + carried).neg_()
+            cross = eliminated.cross_product(self.state.points[..., part.columns], camera_step, unknown_step)
+            solved = eliminated.elimination.solve(rhs + cross).neg_()
             point_step[..., part.columns] = solved
             descent -= (rhs * solved).sum((1, 2), dtype=torch.float64)
-            held += (hessian[..., part.columns][:, DIAGONAL] * solved.square()).sum((1, 2), dtype=torch.float64)
-        held = held * self._damping
-        squared_sigmas = -(self.reduced_gradient * together).sum(1)
+            squared += (hessian[..., part.columns][:, DIAGONAL] * solved.square()).sum((1, 2), dtype=torch.float64)
+        damped = squared * self._damping
+        squared_sigmas = -(self.reduced_gradient * rig_step).sum(1)
         return Step(
             cameras=camera_step,
             points=point_step,
             unknowns=unknown_step,
-            solved=(failed == 0) & together.isfinite().all(1),
-            predicted_decrease=descent + held,
-            leash=held / descent.clamp_min(1e-300),
-            camera_sigmas=squared_sigmas.clamp_min(0.0).sqrt() if self._count else squared_sigmas.fill_(math.inf),
+            solved=(failed == 0) & rig_step.isfinite().all(1),
+            predicted_decrease=descent + damped,
+            damped_share=damped / descent.clamp_min(1e-300),
+            camera_sigmas=squared_sigmas.clamp_min(0.0).sqrt() if self._free_cameras else squared_sigmas.fill_(math.inf),
         )
 
     def solve(self, camera_rhs: Tensor, unknown_rhs: Tensor, point_rhs: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """The whole Hessian's inverse times a right-hand side of cameras (B, C', 6), unknowns (B, K) and points (B, 3, N).
+        """``H^-1 b`` with the whole (damped) Hessian, for a right-hand side b.
+
+        Args:
+            camera_rhs: (B, C', 6).
+            unknown_rhs: (B, K).
+            point_rhs: (B, 3, N).
 
         Returns:
-            The three parts of the solution, and (B,) whether the Hessian is positive definite.
+            The solution in the same three parts, and whether the Hessian is positive definite (B,).
         """
         reduced_rhs = torch.cat([camera_rhs.flatten(1), unknown_rhs], dim=1)
-        for part, eliminated in self._eliminations() if self._count else ():
-            rows, half = eliminated.reductions(self._points(part.columns), point_rhs[..., part.columns])
-            reduced_rhs = reduced_rhs - (rows @ half[..., None])[..., 0]
+        for part, eliminated in self._eliminated_parts() if self._free_cameras else ():
+            rows, solved = eliminated.forward_solve_cross(self._points(part.columns), point_rhs[..., part.columns])
+            reduced_rhs = reduced_rhs - (rows @ solved[..., None])[..., 0]
         factor, failed = torch.linalg.cholesky_ex(self.reduced)
-        together = torch.cholesky_solve(reduced_rhs[..., None], factor)[..., 0]
-        cameras, unknowns = self._split(together)
+        rig = torch.cholesky_solve(reduced_rhs[..., None], factor)[..., 0]
+        cameras, unknowns = self._split(rig)
         points = torch.empty_like(point_rhs)
-        for part, eliminated in self._eliminations():
-            carried = eliminated.carried(self.state.points[..., part.columns], cameras, unknowns)
-            points[..., part.columns] = eliminated.elimination.solve(point_rhs[..., part.columns] - carried)
-        finite = together.isfinite().all(1) & points.flatten(1).isfinite().all(1)
+        for part, eliminated in self._eliminated_parts():
+            cross = eliminated.cross_product(self.state.points[..., part.columns], cameras, unknowns)
+            points[..., part.columns] = eliminated.elimination.solve(point_rhs[..., part.columns] - cross)
+        finite = rig.isfinite().all(1) & points.flatten(1).isfinite().all(1)
         return cameras, unknowns, points, (failed == 0) & finite
 
     def point_variance(self) -> Tensor:
-        """Mean variance along the axes of each point (B, N), cameras known, stick ends taken singly, square metres."""
+        """Variance of each point for known cameras, mean over the three axes, (B, N), square metres.
+
+        Couplings between points are ignored.
+        """
         variance = torch.empty_like(self.point_hessian[:, 0])
         for columns in self.objective.measurements.chunks():
             variance[:, columns] = inverse_diagonal(self.point_hessian[..., columns]).mean(1)
         return variance
 
-    def response(self) -> Tensor:
-        """How the points follow the cameras: ``-H_xx^-1 H_xc`` as (B, 6 C' + K, 3, N), a step of the points per unit."""
+    def point_response(self) -> Tensor:
+        """``-H_xx^-1 H_xc``: movement of the points per unit step of the cameras, (B, 6 C' + K, 3, N)."""
         points = self.state.points
         response = points.new_empty(len(points), self.reduced.shape[1], *points.shape[1:])
         for part in self._parts:
-            eliminated = self._eliminated(part)
-            rows = cross_rows(eliminated.cross, self._points(part.columns)).flatten(1, 2)
-            if eliminated.coupling is not None:
-                rows = torch.cat([rows, eliminated.coupling], dim=1)
+            (camera_blocks, _, unknown_blocks), elimination = self._eliminate(part)
+            rows = cross_rows(camera_blocks, self._points(part.columns)).flatten(1, 2)
+            if unknown_blocks is not None:
+                rows = torch.cat([rows, unknown_blocks], dim=1)
             for row in range(rows.shape[1]):
-                response[:, row][..., part.columns] = -eliminated.elimination.solve(rows[:, row])
+                response[:, row][..., part.columns] = -elimination.solve(rows[:, row])
         return response
 
     def records(self, stage: str, iterations: list[int], dampings: list[float], steps_m: list[float]) -> list[IterationRecord]:
-        """The records of the iterations that end here, one for each session."""
+        """The record of each session for an iteration that ends at this state."""
         m = self.objective.measurements
         terms = {name: value.tolist() for name, value in self.terms.items()}
         lengths = m.stick_lengths_m(self.state.points).flatten(1).nanmean(1).tolist()
@@ -235,19 +251,19 @@ class NormalEquations:
             for session, pixels in enumerate(self.reprojection_px.tolist())
         ]
 
-    def _add_structure(self) -> None:
-        """What the losses on points alone contribute, and the couplings they make."""
+    def _add_point_losses(self) -> Couplings:
+        """Add the losses without cameras to the points' gradient and Hessian. Returns the blocks off the diagonal."""
         m = self.objective.measurements
         self.point_hessian = m.pixels.new_zeros(m.sessions, 6, m.num_columns)
         self.point_gradient = m.pixels.new_zeros(m.sessions, 3, m.num_columns)
         if not bool(m.active.all()):
             identity = self.point_hessian.new_tensor(IDENTITY)[:, None]
             self.point_hessian.copy_(torch.where(m.active[:, None], self.point_hessian, identity))
-        self._couplings = Couplings(self._add_frame_losses(), self._add_track_losses())
+        return Couplings(self._add_frame_losses(), self._add_track_losses())
 
     def _add_frame_losses(self) -> WithinFrame:
-        """Add the frame losses to the points' blocks; returns the blocks between different points of a frame."""
-        m, between = self.objective.measurements, WithinFrame()
+        """Add the frame losses. Returns the blocks between different points of a frame."""
+        m, within = self.objective.measurements, WithinFrame()
         hessian, gradient = m.by_frame(self.point_hessian), m.by_frame(self.point_gradient)
         for name, terms in self.objective.linearise_frames(self.state, self._exact).items():
             self.terms[name] = self.terms[name] + terms.cost
@@ -257,16 +273,16 @@ class NormalEquations:
                 gradient.index_add_(-1, first, slopes[:, i])
                 hessian.index_add_(-1, first, six_entries(blocks[:, i, i].flatten(-2)).unflatten(-1, blocks.shape[-2:]))
                 for j, second in enumerate(members[i + 1 :], i + 1):
-                    between.add(first, second, blocks[:, i, j])
-        return between
+                    within.add(first, second, blocks[:, i, j])
+        return within
 
     def _add_track_losses(self) -> BetweenFrames | None:
-        """Add the track losses to the points' blocks; returns the couplings of a point's frames."""
+        """Add the track losses. Returns the blocks between different frames of a point."""
         m = self.objective.measurements
         if not self.objective.track_losses:
             return None
         hessian, gradient = m.by_frame(self.point_hessian), m.by_frame(self.point_gradient)
-        coupling = [hessian.new_zeros(m.sessions, max(0, m.frames - step), m.points_per_frame) for step in (1, 2)]
+        between = [hessian.new_zeros(m.sessions, max(0, m.frames - step), m.points_per_frame) for step in (1, 2)]
         for name, terms in self.objective.linearise_tracks(self.state).items():
             self.terms[name] = self.terms[name] + terms.cost
             stencil, frames = self.objective.track_losses[name].stencil, terms.scale.shape[1]
@@ -276,144 +292,191 @@ class NormalEquations:
                 for axis in DIAGONAL:
                     hessian[:, axis, i : i + frames] += factor**2 * information
                 for j, other in enumerate(stencil[i + 1 :], i + 1):
-                    coupling[j - i - 1][:, i : i + frames] += factor * other * information
-        return BetweenFrames(*coupling)
+                    between[j - i - 1][:, i : i + frames] += factor * other * information
+        return BetweenFrames(*between)
 
-    def _add_keypoints(self) -> None:
-        """The camera-point losses of every part, and its elimination where the cameras are unknowns."""
-        m, count, zeros = self.objective.measurements, self._count, self.state.points.new_zeros
-        further, kinds = self._unknowns.count, self._unknowns.components
+    def _add_camera_point_losses(self) -> None:
+        """Linearise the camera-point losses of every part and, if the cameras are free, build the reduced camera system."""
+        m, free, zeros = self.objective.measurements, self._free_cameras, self.state.points.new_zeros
+        size = 6 * free + self._unknowns.count
         squares, weights = zeros(m.sessions, m.num_cameras), zeros(m.sessions, m.num_cameras)
-        gradient_moments, hessian_moments = zeros(m.sessions, 3 * count, 4), zeros(m.sessions, 6 * count, 10)
-        own_gradient, own_hessian = zeros(m.sessions, m.num_cameras, kinds), zeros(m.sessions, m.num_cameras, kinds, kinds)
-        own_moments = zeros(m.sessions, count, kinds, 3, 4)
-        size = 6 * count + further
         reduced, reduced_gradient = zeros(m.sessions, size, size), zeros(m.sessions, size)
-        if (2 * count + further) * m.sessions * m.num_columns * 3 * m.pixels.element_size() <= _KEPT_BYTES:
-            self._kept = []
+        sums = _CameraSums(self.state.points, m.num_cameras, free, self._unknowns.components)
+        if (2 * free + self._unknowns.count) * m.sessions * m.num_columns * 3 * m.pixels.element_size() <= _MAX_CACHED_BYTES:
+            self._cache = []
         for part in self._parts:
-            couplings: list[_Coupled] = []
+            chunks: list[_CameraCoupling] = []
             for columns in part.chunks:
-                blocks = self._linearised(columns)
-                for name, block in blocks.items():
-                    self.terms[name] = self.terms[name] + block.cost
-                    squares += block.squares
-                    weights += block.weights
-                gradient, hessian, unknown = _summed(blocks)
+                terms = self._linearise(columns)
+                for name, term in terms.items():
+                    self.terms[name] = self.terms[name] + term.cost
+                    squares += term.squares
+                    weights += term.weights
+                gradient, hessian, unknown = _sum_over_losses(terms)
                 self.point_gradient[..., columns] += gradient.sum(1)
                 self.point_hessian[..., columns] += hessian.sum(1)
-                if count:
-                    points = self._points(columns)
-                    homogeneous = torch.cat([torch.ones_like(points[:, :1]), points], dim=1)
-                    products = homogeneous[:, _PRODUCTS[0]] * homogeneous[:, _PRODUCTS[1]]
-                    gradient_moments += gradient[:, 1:].flatten(1, 2) @ homogeneous.mT
-                    hessian_moments += hessian[:, 1:].flatten(1, 2) @ products.mT
-                    if unknown is not None:
-                        own_gradient += unknown.gradient
-                        own_hessian += unknown.hessian
-                        own_moments += unknown.coupling[:, 1:] @ homogeneous.mT[:, None, None]
-                    couplings.append(self._coupled(gradient, hessian, unknown))
-            if count:
-                eliminated = self._eliminated(part, couplings)
-                rows, half = eliminated.reductions(self._points(part.columns), self.point_gradient[..., part.columns])
+                if free:
+                    sums.add(self._points(columns), gradient, hessian, unknown)
+                    chunks.append(self._camera_coupling(gradient, hessian, unknown))
+            if free:
+                eliminated = self._eliminate(part, chunks)
+                rows, solved = eliminated.forward_solve_cross(
+                    self._points(part.columns), self.point_gradient[..., part.columns]
+                )
                 reduced -= rows @ rows.mT
-                reduced_gradient -= (rows @ half[..., None])[..., 0]
-                if self._kept is not None:
-                    self._kept.append(eliminated)
-        gradient_map, hessian_map = _moment_maps(self.state.points.device)
-        blocks = (hessian_moments.view(m.sessions, count, 60) @ hessian_map).view(m.sessions, count, 6, 6)
-        if self._exact:
-            blocks += _turning(gradient_moments.view(m.sessions, count, 3, 4))
-        own = reduced.new_zeros(m.sessions, size, size)
-        own[:, : 6 * count, : 6 * count].view(m.sessions, count, 6, count, 6).diagonal(dim1=1, dim2=3).copy_(
-            blocks.permute(0, 2, 3, 1)
-        )
-        self.camera_gradient = gradient_moments.view(m.sessions, count, 12) @ gradient_map
-        self.unknown_gradient = reduced.new_zeros(m.sessions, further)
-        if further:
-            share = self._unknowns.share
-            with_poses = own_moments.flatten(3) @ gradient_map
-            own[:, : 6 * count, 6 * count :] = torch.einsum("ckj,bckt->bctj", share[1:], with_poses).flatten(1, 2)
-            own[:, 6 * count :, : 6 * count] = own[:, : 6 * count, 6 * count :].mT
-            own[:, 6 * count :, 6 * count :] = torch.einsum("cki,bckl,clj->bij", share, own_hessian, share)
-            self.unknown_gradient = torch.einsum("ckj,bck->bj", share, own_gradient)
-            self._add_prior(own[:, 6 * count :, 6 * count :])
-        self._diagonal = own.diagonal(dim1=1, dim2=2).clone()
-        own.diagonal(dim1=1, dim2=2).mul_(1 + self._damping[:, None])
-        self.reduced = reduced.add_(own)
+                reduced_gradient -= (rows @ solved[..., None])[..., 0]
+                if self._cache is not None:
+                    self._cache.append(eliminated)
+        rig_hessian = self._rig_hessian(sums)
+        self._rig_diagonal = rig_hessian.diagonal(dim1=1, dim2=2).clone()
+        rig_hessian.diagonal(dim1=1, dim2=2).mul_(1 + self._damping[:, None])
+        self.reduced = reduced.add_(rig_hessian)
         self.reduced_gradient = reduced_gradient + torch.cat([self.camera_gradient.flatten(1), self.unknown_gradient], dim=1)
         self.reprojection_px = (squares / weights.clamp_min(1e-300)).sqrt()
 
-    def _linearised(self, columns: Columns) -> dict[str, CameraPointTerms]:
-        return self.objective.linearise_chunk(self.state, columns, self._exact, self._unknowns.count > 0)
+    def _rig_hessian(self, sums: _CameraSums) -> Tensor:
+        """H_cc with the lens and clock unknowns, (B, 6 C' + K, 6 C' + K). Sets the gradients and adds the prior."""
+        free, unknowns = self._free_cameras, self._unknowns
+        tangents, size = 6 * free, 6 * free + unknowns.count
+        hessian = self.state.points.new_zeros(len(self.state.points), size, size)
+        poses = hessian[:, :tangents, :tangents].view(len(hessian), free, 6, free, 6)
+        poses.diagonal(dim1=1, dim2=3).copy_(sums.pose_hessian(self._exact).permute(0, 2, 3, 1))
+        self.camera_gradient = sums.pose_gradient()
+        self.unknown_gradient = hessian.new_zeros(len(hessian), unknowns.count)
+        if unknowns.count:
+            share = unknowns.share
+            with_poses = torch.einsum("ckj,bckt->bctj", share[1:], sums.unknown_pose_hessian()).flatten(1, 2)
+            hessian[:, :tangents, tangents:] = with_poses
+            hessian[:, tangents:, :tangents] = with_poses.mT
+            hessian[:, tangents:, tangents:] = torch.einsum("cki,bckl,clj->bij", share, sums.unknown_hessian, share)
+            self.unknown_gradient = torch.einsum("ckj,bck->bj", share, sums.unknown_gradient)
+            self._add_prior(hessian[:, tangents:, tangents:])
+        return hessian
 
     def _add_prior(self, hessian: Tensor) -> None:
-        """The prior of the cameras' further unknowns, to the terms, their gradient and their block (B, K, K)."""
+        """Add the prior of the lens and clock unknowns to the terms, to their gradient, and to their block (B, K, K)."""
         self.terms[PRIOR], gradient, information = self.objective.linearise_prior(self.state)
         self.unknown_gradient += gradient
         hessian.diagonal(dim1=1, dim2=2).add_(information)
 
-    def _split(self, together: Tensor) -> tuple[Tensor, Tensor]:
-        """Tangents (B, C', 6) and further unknowns (B, K) of both side by side."""
-        cameras = 6 * self._count
-        return together[:, :cameras].unflatten(1, (self._count, 6)), together[:, cameras:]
+    def _linearise(self, columns: Columns) -> dict[str, CameraPointTerms]:
+        return self.objective.linearise_chunk(self.state, columns, self._exact, self._unknowns.count > 0)
 
-    def _eliminations(self) -> Iterator[tuple[Part, _Eliminated]]:
-        """All parts, eliminated: kept ones, or done again."""
+    def _split(self, rig: Tensor) -> tuple[Tensor, Tensor]:
+        """Tangents (B, C', 6) and lens and clock unknowns (B, K) of a vector (B, 6 C' + K)."""
+        tangents = 6 * self._free_cameras
+        return rig[:, :tangents].unflatten(1, (self._free_cameras, 6)), rig[:, tangents:]
+
+    def _eliminated_parts(self) -> Iterator[tuple[Part, _EliminatedPart]]:
+        """All parts, eliminated: from the cache, or computed again."""
         for index, part in enumerate(self._parts):
-            yield part, self._kept[index] if self._kept else self._eliminated(part)
+            yield part, self._cache[index] if self._cache else self._eliminate(part)
 
-    def _eliminated(self, part: Part, couplings: list[_Coupled] | None = None) -> _Eliminated:
-        """A part's factor and its coupling to the cameras, by chunk where that is at hand."""
+    def _eliminate(self, part: Part, chunks: list[_CameraCoupling] | None = None) -> _EliminatedPart:
+        """Factor a part. ``chunks`` are the couplings of its chunks; None to compute them."""
         elimination = part.eliminate(raised(self.point_hessian[..., part.columns], self._damping))
-        if not self._count:
-            nothing = self.point_hessian[:, None, :, part.columns][:, :0]
-            return _Eliminated(nothing, None, None, elimination)
-        if couplings is None:
-            chunks = (self._linearised(columns) for columns in part.chunks)
-            couplings = [self._coupled(*_summed(chunk)) for chunk in chunks]
-        coupled = _Coupled(*(_joined(pieces) for pieces in zip(*couplings, strict=True)))
-        return _Eliminated(*coupled, elimination)
+        if not self._free_cameras:
+            no_cameras = self.point_hessian[:, None, :, part.columns][:, :0]
+            return _EliminatedPart(_CameraCoupling(no_cameras, None, None), elimination)
+        if chunks is None:
+            terms = (self._linearise(columns) for columns in part.chunks)
+            chunks = [self._camera_coupling(*_sum_over_losses(chunk)) for chunk in terms]
+        coupling = _CameraCoupling(*(_concatenate(tensors) for tensors in zip(*chunks, strict=True)))
+        return _EliminatedPart(coupling, elimination)
 
-    def _coupled(self, gradient: Tensor, hessian: Tensor, unknown: UnknownTerms | None) -> _Coupled:
-        """What ties some points to the cameras, of :func:`_summed`."""
-        coupling = None
+    def _camera_coupling(self, gradient: Tensor, hessian: Tensor, unknown: UnknownTerms | None) -> _CameraCoupling:
+        """The coupling of some columns with the free cameras, from the result of :func:`_sum_over_losses`."""
+        unknown_blocks = None
         if unknown is not None:
             share = self._unknowns.share.to(unknown.coupling.dtype).flatten(0, 1).mT
-            coupling = (share @ unknown.coupling.flatten(3).flatten(1, 2)).unflatten(2, (3, -1))
-        return _Coupled(hessian[:, 1:], gradient[:, 1:] if self._exact else None, coupling)
+            unknown_blocks = (share @ unknown.coupling.flatten(3).flatten(1, 2)).unflatten(2, (3, -1))
+        return _CameraCoupling(hessian[:, 1:], gradient[:, 1:] if self._exact else None, unknown_blocks)
 
     def _points(self, columns: Columns) -> Tensor:
         return self.state.points[..., columns].to(self.point_hessian.dtype)
 
 
-def _joined(pieces: Sequence[Tensor | None]) -> Any:
-    """Tensors of columns side by side, or None if they are none."""
-    found = [piece for piece in pieces if piece is not None]
+class _CameraSums:
+    """Sums over all points from which the cameras' own gradients and Hessian blocks follow.
+
+    B(X) is linear in the homogeneous coordinates h = (1, x, y, z). So the sums of B^T g and of B^T N B over the points are
+    linear in the moments ``sum g h^T`` (3 x 4) and in the moments of N with the ten distinct products h_a h_b.
+
+    Args:
+        like: a tensor (B, ...) with the dtype and device of the sums.
+        cameras: C.
+        free: C', number of free cameras.
+        components: k, number of lens and clock unknowns per camera.
+    """
+
+    unknown_gradient: Tensor
+    """(B, C, k)"""
+    unknown_hessian: Tensor
+    """(B, C, k, k)"""
+
+    def __init__(self, like: Tensor, cameras: int, free: int, components: int) -> None:
+        self._sessions, self._free, zeros = len(like), free, like.new_zeros
+        self._gradient_moments = zeros(self._sessions, 3 * free, 4)
+        self._hessian_moments = zeros(self._sessions, 6 * free, 10)
+        self._unknown_moments = zeros(self._sessions, free, components, 3, 4)
+        self.unknown_gradient = zeros(self._sessions, cameras, components)
+        self.unknown_hessian = zeros(self._sessions, cameras, components, components)
+        self._gradient_map, self._hessian_map = _moment_maps(like.device)
+
+    def add(self, points: Tensor, gradient: Tensor, hessian: Tensor, unknown: UnknownTerms | None) -> None:
+        """Add the points (B, 3, n) of a chunk, with the result of :func:`_sum_over_losses`."""
+        homogeneous = torch.cat([torch.ones_like(points[:, :1]), points], dim=1)
+        products = homogeneous[:, _PRODUCTS[0]] * homogeneous[:, _PRODUCTS[1]]
+        self._gradient_moments += gradient[:, 1:].flatten(1, 2) @ homogeneous.mT
+        self._hessian_moments += hessian[:, 1:].flatten(1, 2) @ products.mT
+        if unknown is not None:
+            self.unknown_gradient += unknown.gradient
+            self.unknown_hessian += unknown.hessian
+            self._unknown_moments += unknown.coupling[:, 1:] @ homogeneous.mT[:, None, None]
+
+    def pose_gradient(self) -> Tensor:
+        """Gradient with respect to the tangents, (B, C', 6)."""
+        return self._gradient_moments.view(self._sessions, self._free, 12) @ self._gradient_map
+
+    def pose_hessian(self, exact: bool) -> Tensor:
+        """Hessian block of each camera's tangent, (B, C', 6, 6)."""
+        blocks = (self._hessian_moments.view(self._sessions, self._free, 60) @ self._hessian_map).unflatten(-1, (6, 6))
+        if exact:
+            blocks += _pose_curvature(self._gradient_moments.view(self._sessions, self._free, 3, 4))
+        return blocks
+
+    def unknown_pose_hessian(self) -> Tensor:
+        """Hessian blocks between each camera's lens and clock unknowns and its tangent, (B, C', k, 6)."""
+        return self._unknown_moments.flatten(3) @ self._gradient_map
+
+
+def _concatenate(tensors: Sequence[Tensor | None]) -> Any:
+    """Tensors concatenated along the columns; None if they are None."""
+    found = [tensor for tensor in tensors if tensor is not None]
     return torch.cat(found, dim=-1) if len(found) > 1 else next(iter(found), None)
 
 
-def _summed(blocks: Mapping[str, CameraPointTerms]) -> tuple[Tensor, Tensor, UnknownTerms | None]:
-    """Gradients (B, C, 3, n), Hessians (B, C, 6, n) and the terms of further unknowns, of all camera-point losses."""
-    gradient = reduce(torch.add, (block.gradient for block in blocks.values()))
-    hessian = reduce(torch.add, (block.hessian for block in blocks.values()))
-    found = [block.unknown for block in blocks.values() if block.unknown is not None]
-    unknown = UnknownTerms(*(reduce(torch.add, of) for of in zip(*found, strict=True))) if found else None
+def _sum_over_losses(terms: Mapping[str, CameraPointTerms]) -> tuple[Tensor, Tensor, UnknownTerms | None]:
+    """Sums over the camera-point losses: gradients (B, C, 3, n), Hessians (B, C, 6, n), terms of lens and clock unknowns."""
+    gradient = reduce(torch.add, (term.gradient for term in terms.values()))
+    hessian = reduce(torch.add, (term.hessian for term in terms.values()))
+    found = [term.unknown for term in terms.values() if term.unknown is not None]
+    unknown = UnknownTerms(*(reduce(torch.add, tensors) for tensors in zip(*found, strict=True))) if found else None
     return gradient, hessian, unknown
 
 
-def _turning(moments: Tensor) -> Tensor:
-    """What the exact Hessian adds for turning a camera about the world's origin, (B, C', 6, 6), of moments of g (B, C', 3, 4).
+def _pose_curvature(moments: Tensor) -> Tensor:
+    """Addition of the exact Hessian to the pose block of each camera, (B, C', 6, 6), from the moments of g, (B, C', 3, 4).
 
-    To second order ``Exp(nu, omega) X = X + nu + omega x X + (omega x nu + omega x (omega x X)) / 2``.
+    It is the second-order term of ``Exp(nu, omega) X = X + nu + omega x X + (omega x nu + omega x (omega x X)) / 2 + ...``.
     """
     gradient, by_point = moments[..., 0], moments[..., 1:]
-    added = moments.new_zeros(*moments.shape[:2], 6, 6)
-    added[..., :3, 3:] = se3.hat(gradient) / 2
-    added[..., 3:, :3] = added[..., :3, 3:].mT
+    curvature = moments.new_zeros(*moments.shape[:2], 6, 6)
+    curvature[..., :3, 3:] = se3.hat(gradient) / 2
+    curvature[..., 3:, :3] = curvature[..., :3, 3:].mT
     trace = by_point.diagonal(dim1=-2, dim2=-1).sum(-1)
-    added[..., 3:, 3:] = (by_point + by_point.mT) / 2 - trace[..., None, None] * torch.eye(3).to(moments)
-    return added
+    curvature[..., 3:, 3:] = (by_point + by_point.mT) / 2 - trace[..., None, None] * torch.eye(3).to(moments)
+    return curvature
 
 
 _PRODUCTS = ([0, 0, 0, 0, 1, 1, 1, 2, 2, 3], [0, 1, 2, 3, 1, 2, 3, 2, 3, 3])
@@ -422,10 +485,9 @@ _PRODUCTS = ([0, 0, 0, 0, 1, 1, 1, 2, 2, 3], [0, 1, 2, 3, 1, 2, 3, 2, 3, 3])
 
 @lru_cache(maxsize=8)
 def _moment_maps(device: torch.device) -> tuple[Tensor, Tensor]:
-    """The maps from moments of gradients (12) and of Hessians (60) to those of a camera, (12, 6) and (60, 36).
+    """Linear maps from the moments of g (12) to B^T g, (12, 6), and from the moments of N (60) to B^T N B, (60, 36).
 
-    With B(X) = sum_a (1, X)_a B_a the sums of B^T g and B^T N B over the points are linear in the moments of g with
-    (1, x, y, z) and of N with their ten products.
+    With B(X) = sum_a h_a B_a: B^T g = sum_a B_a^T (g h_a), and B^T N B = sum_ab B_a^T (N h_a h_b) B_b.
     """
     basis = torch.zeros(4, 3, 6, dtype=torch.float64)
     basis[0, :, :3] = torch.eye(3)

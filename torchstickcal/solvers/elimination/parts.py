@@ -1,4 +1,4 @@
-"""How the points are divided for elimination: by slices of frames, or by tracks where a loss couples consecutive frames."""
+"""Partition of the points for their elimination: by slices of frames, or by tracks if a loss couples consecutive frames."""
 
 from __future__ import annotations
 
@@ -14,35 +14,35 @@ from torchstickcal.model.unknowns import Columns
 from torchstickcal.solvers.elimination.points import PointElimination
 from torchstickcal.solvers.elimination.tracks import TrackElimination
 
-_TRACK_POINTS = 3000
-"""Points of tracks eliminated together, so that their right-hand sides stay in the cache."""
+_MAX_TRACK_POINTS = 3000
+"""Number of points of the tracks that are eliminated together. Their right-hand sides should fit into the cache."""
 
 Cluster = tuple[int, ...]
-"""Points of one frame that losses couple with one another."""
+"""Points of one frame that losses couple with each other."""
 
 
 class WithinFrame:
-    """Blocks of the points' Hessian between two different points of a frame."""
+    """Blocks of the points' Hessian between two different points of the same frame."""
 
     def __init__(self) -> None:
         self._blocks: dict[tuple[int, int], Tensor] = {}
 
     def add(self, rows: Tensor, columns: Tensor, blocks: Tensor) -> None:
-        """Add blocks (B, 3, 3, F, G) between points (G,), the rows', and points (G,), the columns'."""
+        """Add blocks (B, 3, 3, F, G) for G pairs of points: ``rows`` (G,) and ``columns`` (G,)."""
         for row, column, block in zip(rows.tolist(), columns.tolist(), blocks.unbind(-1), strict=True):
             if row > column:
                 row, column, block = column, row, block.transpose(1, 2)
-            known = self._blocks.get((row, column))
-            self._blocks[row, column] = block if known is None else known + block
+            earlier = self._blocks.get((row, column))
+            self._blocks[row, column] = block if earlier is None else earlier + block
 
     def between(self, row: int, column: int) -> Tensor | None:
-        """The blocks (B, 3, 3, F) between two points, the row's index being the smaller; None where nothing couples them."""
+        """The blocks (B, 3, 3, F) between two points, ``row < column``; None if no loss couples them."""
         return self._blocks.get((row, column))
 
 
 @dataclass(frozen=True)
 class BetweenFrames:
-    """Blocks of the points' Hessian between frames of one point: multiples of the identity."""
+    """Blocks of the points' Hessian between two frames of the same point, as factors of the identity."""
 
     next_frame: Tensor
     """(B, F - 1, P), between frames f and f + 1"""
@@ -52,66 +52,66 @@ class BetweenFrames:
 
 @dataclass(frozen=True)
 class Couplings:
-    """What is off the diagonal blocks of the points' Hessian."""
+    """The blocks of the points' Hessian off the diagonal."""
 
     within: WithinFrame
     between: BetweenFrames | None
-    """None where no loss couples consecutive frames"""
+    """None if no loss couples frames"""
 
 
 class Part(Protocol):
-    """Points that no loss couples with points outside."""
+    """A set of columns that no loss couples with other columns."""
 
     @property
     def columns(self) -> Columns:
-        """Their columns."""
+        """The columns of the part."""
         ...
 
     @property
     def chunks(self) -> list[Columns]:
-        """The same columns, in order, in pieces to be worked on at a time."""
+        """The same columns in the same order, in chunks that are linearised at a time."""
         ...
 
     def eliminate(self, hessian: Tensor) -> PointElimination | TrackElimination:
-        """The factor of their Hessian with diagonal blocks (B, 6, n)."""
+        """Factor the part's Hessian with the diagonal blocks (B, 6, n)."""
         ...
 
 
 def parts(measurements: Measurements, clusters: Sequence[Cluster], couplings: Couplings) -> list[Part]:
-    """Parts that together are all columns.
+    """A partition of all columns.
 
     Args:
         measurements: the sessions.
         clusters: the points that losses couple within a frame.
-        couplings: the blocks that couple them.
+        couplings: the blocks off the diagonal.
     """
     m = measurements
     if couplings.between is not None:
-        whole = slice(0, m.frames)
+        all_frames = slice(0, m.frames)
         single = [(point,) for point in range(m.points_per_frame) if not any(point in cluster for cluster in clusters)]
-        together = max(1, _TRACK_POINTS // (m.frames * m.sessions))
-        return [_Clusters(m, members, whole, couplings) for members in _alike([*single, *clusters], together)]
+        batches = _batches([*single, *clusters], max(1, _MAX_TRACK_POINTS // (m.frames * m.sessions)))
+        return [_Clusters(m, batch, all_frames, couplings) for batch in batches]
     large = [cluster for cluster in clusters if len(cluster) > 2]
     pairs = [cluster for cluster in clusters if len(cluster) == 2]
-    found: list[Part] = []
+    partition: list[Part] = []
     for frames in m.frame_slices():
         if sum(map(len, large)) < m.points_per_frame:
-            found.append(_Frames(m, frames, pairs, large, couplings.within))
-        found += [_Clusters(m, members, frames, couplings) for members in _alike(large, len(large))]
-    return found
+            partition.append(_PointsAndPairs(m, frames, pairs, large, couplings.within))
+        partition += [_Clusters(m, batch, frames, couplings) for batch in _batches(large, len(large))]
+    return partition
 
 
-def _alike(clusters: Sequence[Cluster], together: int) -> list[list[Cluster]]:
-    """Clusters of equal size, at most so many together."""
-    found: list[list[Cluster]] = []
+def _batches(clusters: Sequence[Cluster], max_length: int) -> list[list[Cluster]]:
+    """Batches of at most ``max_length`` clusters, all of the same size."""
+    batches: list[list[Cluster]] = []
     for size in sorted({len(cluster) for cluster in clusters}):
-        alike = [cluster for cluster in clusters if len(cluster) == size]
-        found += [alike[first : first + together] for first in range(0, len(alike), together)]
-    return found
+        equal = [cluster for cluster in clusters if len(cluster) == size]
+        batches += [equal[first : first + max_length] for first in range(0, len(equal), max_length)]
+    return batches
 
 
-class _Frames:
-    """The points of some frames but for those in large clusters: single points and pairs."""
+class _PointsAndPairs:
+    """Single points and pairs of points in some frames: all points that are not in a large cluster."""
 
     def __init__(
         self,
@@ -122,55 +122,55 @@ class _Frames:
         within: WithinFrame,
     ) -> None:
         m, device = measurements, measurements.pixels.device
-        left_out = {point for cluster in large for point in cluster}
-        points = [point for point in range(m.points_per_frame) if point not in left_out]
-        first = torch.arange(frames.start, frames.stop, device=device)[:, None]
+        excluded = {point for cluster in large for point in cluster}
+        points = [point for point in range(m.points_per_frame) if point not in excluded]
+        frame = torch.arange(frames.start, frames.stop, device=device)[:, None]
         self.columns: Columns = slice(frames.start * m.points_per_frame, frames.stop * m.points_per_frame)
-        if left_out:
-            self.columns = (m.points_per_frame * first + torch.tensor(points, dtype=torch.long, device=device)).flatten()
+        if excluded:
+            self.columns = (m.points_per_frame * frame + torch.tensor(points, dtype=torch.long, device=device)).flatten()
         self.chunks: list[Columns] = [self.columns]
-        ends = torch.tensor([[points.index(end) for end in pair] for pair in pairs], dtype=torch.long, device=device)
-        place = len(points) * (first - frames.start)
-        self._starts, self._ends = ((place + side).flatten() for side in ends.view(-1, 2).unbind(1))
+        members = torch.tensor([[points.index(point) for point in pair] for pair in pairs], dtype=torch.long, device=device)
+        frame_start = len(points) * (frame - frames.start)
+        self._first, self._second = ((frame_start + member).flatten() for member in members.view(-1, 2).unbind(1))
         blocks = [block[..., frames] for a, b in pairs if (block := within.between(a, b)) is not None]
-        self._coupling = torch.stack(blocks, dim=-1).flatten(-2) if blocks else None
+        self._pair_blocks = torch.stack(blocks, dim=-1).flatten(-2) if blocks else None
 
     def eliminate(self, hessian: Tensor) -> PointElimination:
-        return PointElimination(hessian, self._starts, self._ends, self._coupling)
+        return PointElimination(hessian, self._first, self._second, self._pair_blocks)
 
 
 class _Clusters:
-    """Clusters of equal size over some frames; columns in the order cluster, frame, member."""
+    """T clusters of q points each, in some frames. The columns are in the order cluster, frame, member."""
 
-    def __init__(self, measurements: Measurements, members: Sequence[Cluster], frames: slice, couplings: Couplings) -> None:
+    def __init__(self, measurements: Measurements, clusters: Sequence[Cluster], frames: slice, couplings: Couplings) -> None:
         m, device = measurements, measurements.pixels.device
-        self._members, self._frames, self._couplings = members, frames, couplings
-        self._points = torch.tensor(members, device=device)
-        place = m.points_per_frame * torch.arange(frames.start, frames.stop, device=device)[:, None]
-        self.columns: Columns = (self._points[:, None] + place).flatten()
+        self._clusters, self._frames, self._couplings = clusters, frames, couplings
+        self._points = torch.tensor(clusters, device=device)
+        frame_start = m.points_per_frame * torch.arange(frames.start, frames.stop, device=device)[:, None]
+        self.columns: Columns = (self._points[:, None] + frame_start).flatten()
         self.chunks: list[Columns] = list(self.columns.split(max(1, m.chunk_keypoints // (m.sessions * m.num_cameras))))
 
     def eliminate(self, hessian: Tensor) -> TrackElimination:
         between, frames = self._couplings.between, self._frames.stop - self._frames.start
-        by_track = hessian.unflatten(-1, (len(self._members), frames, -1))
-        steps = None
+        by_track = hessian.unflatten(-1, (len(self._clusters), frames, -1))
+        factors = None
         if between is not None:
-            next_frame, second_frame = (s[..., self._points].to(hessian) for s in (between.next_frame, between.second_frame))
-            steps = next_frame, second_frame
-        return TrackElimination(by_track, self._within(hessian, frames), steps)
+            next_frame, second_frame = (f[..., self._points].to(hessian) for f in (between.next_frame, between.second_frame))
+            factors = next_frame, second_frame
+        return TrackElimination(by_track, self._within_blocks(hessian, frames), factors)
 
-    def _within(self, like: Tensor, frames: int) -> Tensor | None:
+    def _within_blocks(self, like: Tensor, frames: int) -> Tensor | None:
         """The blocks between the points of each cluster, (B, T, F, 3 q, 3 q), zero on the diagonal; None for single points."""
-        size = len(self._members[0])
+        size = len(self._clusters[0])
         if size == 1:
             return None
-        blocks = like.new_zeros(len(like), len(self._members), frames, 3 * size, 3 * size)
-        for number, cluster in enumerate(self._members):
+        blocks = like.new_zeros(len(like), len(self._clusters), frames, 3 * size, 3 * size)
+        for number, cluster in enumerate(self._clusters):
             for i, row in enumerate(cluster):
                 for j, column in enumerate(cluster[i + 1 :], i + 1):
                     block = self._couplings.within.between(row, column)
                     if block is not None:
-                        at = block[..., self._frames].movedim(-1, 1).to(like.dtype)
-                        blocks[:, number, :, 3 * i : 3 * i + 3, 3 * j : 3 * j + 3] = at
-                        blocks[:, number, :, 3 * j : 3 * j + 3, 3 * i : 3 * i + 3] = at.mT
+                        by_frame = block[..., self._frames].movedim(-1, 1).to(like.dtype)
+                        blocks[:, number, :, 3 * i : 3 * i + 3, 3 * j : 3 * j + 3] = by_frame
+                        blocks[:, number, :, 3 * j : 3 * j + 3, 3 * i : 3 * i + 3] = by_frame.mT
         return blocks

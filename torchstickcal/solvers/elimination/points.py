@@ -1,6 +1,6 @@
-"""Elimination of single points (3 x 3) and of pairs of points of one frame, as the ends of a stick (6 x 6).
+"""Elimination of single points (3 x 3 blocks) and of pairs of points in one frame, such as the ends of a stick (6 x 6 blocks).
 
-All blocks of a part of the columns are factored at once. With H = L L^T the factor serves as L^-1 b (half solve) and as H^-1 b.
+The Hessian of n columns is factored at once, ``H = L L^T``.
 """
 
 from __future__ import annotations
@@ -9,77 +9,89 @@ import torch
 from torch import Tensor
 
 from torchstickcal.geometry.symmetric import backward, cholesky, forward, gram
-from torchstickcal.solvers.elimination.cross_blocks import add_rotations, twist_rows
+from torchstickcal.solvers.elimination.cross_blocks import add_rotation_rows, rotation_curvature_rows
 
 
 class PointElimination:
-    """Cholesky factor of the structure's Hessian at n columns.
+    """Cholesky factor L of the points' Hessian for n columns.
+
+    With a pair's Hessian ``[[A, C], [C^T, D]]``, A = L_A L_A^T and D - C^T A^-1 C = L_D L_D^T, the factor of the pair is
+    ``[[L_A, 0], [C^T L_A^-T, L_D]]``.
 
     Args:
-        hessian: diagonal blocks (B, 6, n), positive definite, the pairs' shares included.
-        starts: (m,), columns of the first points of pairs.
-        ends: (m,), columns of their second points.
-        coupling: (B, 3, 3, m), the blocks between the first (rows) and the second; None where there is none.
+        hessian: diagonal blocks, (B, 6, n), positive definite. They include all losses, also those that couple pairs.
+        first: (m,), columns of the first points of the pairs.
+        second: (m,), columns of the second points of the pairs.
+        pair_blocks: C, the blocks between first (rows) and second points, (B, 3, 3, m); None if no points are coupled.
     """
 
-    def __init__(self, hessian: Tensor, starts: Tensor, ends: Tensor, coupling: Tensor | None) -> None:
-        self._starts, self._ends, self._coupled = starts, ends, coupling is not None
-        if coupling is None:
+    def __init__(self, hessian: Tensor, first: Tensor, second: Tensor, pair_blocks: Tensor | None) -> None:
+        self._first, self._second, self._has_pairs = first, second, pair_blocks is not None
+        if pair_blocks is None:
             self._lower = cholesky(hessian)
             return
-        at_starts = cholesky(hessian[..., starts])
-        self._coupling = forward(at_starts.unsqueeze(-3), -coupling.transpose(-3, -2))
-        reduced = hessian.clone()
-        reduced[..., ends] -= gram(self._coupling)
-        self._lower = cholesky(reduced)
-        self._carry = forward(self._lower[..., ends].unsqueeze(-3), self._coupling.transpose(-3, -2))
+        lower_first = cholesky(hessian[..., first])
+        self._pair_factor = forward(lower_first.unsqueeze(-3), -pair_blocks.transpose(-3, -2))
+        """-L_A^-1 C, stored as (B, column, row, m)"""
+        schur = hessian.clone()
+        schur[..., second] -= gram(self._pair_factor)
+        self._lower = cholesky(schur)
+        self._first_to_second = forward(self._lower[..., second].unsqueeze(-3), self._pair_factor.transpose(-3, -2))
+        """-L_D^-1 C^T L_A^-T, stored as (B, column, row, m)"""
 
-    def half_solve(self, rhs: Tensor) -> Tensor:
-        """``L^-1 b`` of a right-hand side (B, 3, n)."""
-        half = forward(self._lower, rhs)
-        if self._coupled:
-            half[..., self._ends] += (self._carry * half[..., self._starts].unsqueeze(-2)).sum(-3)
-        return half
+    def forward_solve(self, rhs: Tensor) -> Tensor:
+        """``L^-1 b`` for right-hand sides b, (B, 3, n)."""
+        solved = forward(self._lower, rhs)
+        if self._has_pairs:
+            solved[..., self._second] += (self._first_to_second * solved[..., self._first].unsqueeze(-2)).sum(-3)
+        return solved
 
-    def back_solve(self, half: Tensor) -> Tensor:
-        """``L^-T b`` of a right-hand side (B, 3, n), differentiable by it."""
-        if self._coupled:
-            at_ends = backward(self._lower[..., self._ends], half[..., self._ends])
-            half = half.index_add(-1, self._starts, (self._coupling * at_ends.unsqueeze(-2)).sum(-3))
-        return backward(self._lower, half)
+    def backward_solve(self, rhs: Tensor) -> Tensor:
+        """``L^-T b`` for right-hand sides b, (B, 3, n). Differentiable with respect to b."""
+        if self._has_pairs:
+            second = backward(self._lower[..., self._second], rhs[..., self._second])
+            rhs = rhs.index_add(-1, self._first, (self._pair_factor * second.unsqueeze(-2)).sum(-3))
+        return backward(self._lower, rhs)
 
     def solve(self, rhs: Tensor) -> Tensor:
-        """``H^-1 b`` of a right-hand side (B, 3, n)."""
-        return self.back_solve(self.half_solve(rhs))
+        """``H^-1 b`` for right-hand sides b, (B, 3, n)."""
+        return self.backward_solve(self.forward_solve(rhs))
 
-    def reductions(
-        self, cross: Tensor, points: Tensor, gradient: Tensor, twist: Tensor | None = None, coupling: Tensor | None = None
+    def forward_solve_cross(
+        self,
+        camera_blocks: Tensor,
+        points: Tensor,
+        gradient: Tensor,
+        camera_gradients: Tensor | None = None,
+        unknown_blocks: Tensor | None = None,
     ) -> tuple[Tensor, Tensor]:
-        """``(L^-1 H_xc)^T`` (B, 6 C' + K, 3 n) and ``L^-1 g`` (B, 3 n).
+        """``(L^-1 H_xc)^T`` (B, 6 C' + K, 3 n), with the K lens and clock unknowns last, and ``L^-1 g`` (B, 3 n).
 
         Args:
-            cross: the blocks N_c of C' cameras, (B, C', 6, n).
+            camera_blocks: N_c of C' cameras, (B, C', 6, n).
             points: X, (B, 3, n).
             gradient: g, (B, 3, n).
-            twist: the gradients of each camera's part of the cost, (B, C', 3, n), where H_xc is to be exact.
-            coupling: with the cameras' K further unknowns, (B, K, 3, n).
+            camera_gradients: the gradient of each camera's part of the cost, (B, C', 3, n), for the exact Hessian; None for the
+                Gauss-Newton Hessian.
+            unknown_blocks: H_xk, the blocks between the points and the lens and clock unknowns, (B, K, 3, n); None without such
+                unknowns.
         """
-        further = 0 if coupling is None else coupling.shape[1]
-        cameras = 6 * cross.shape[1]
-        rows = cross.new_empty(len(cross), cameras + further, 3, cross.shape[-1])
-        by_camera = rows[:, :cameras].unflatten(1, (-1, 6))
-        _fill_camera_rows(by_camera, self._lower, cross, points)
-        if twist is not None:
-            by_camera[:, :, 3:] += forward(self._lower[:, None, None], twist_rows(twist))
-        if coupling is not None:
-            rows[:, cameras:] = forward(self._lower[:, None], coupling)
-        if self._coupled:
-            rows[..., self._ends] += (self._carry[:, None] * rows[..., self._starts].unsqueeze(-2)).sum(-3)
-        return rows.flatten(2), self.half_solve(gradient).flatten(1)
+        unknowns = 0 if unknown_blocks is None else unknown_blocks.shape[1]
+        tangents = 6 * camera_blocks.shape[1]
+        rows = camera_blocks.new_empty(len(camera_blocks), tangents + unknowns, 3, camera_blocks.shape[-1])
+        by_camera = rows[:, :tangents].unflatten(1, (-1, 6))
+        _fill_camera_rows(by_camera, self._lower, camera_blocks, points)
+        if camera_gradients is not None:
+            by_camera[:, :, 3:] += forward(self._lower[:, None, None], rotation_curvature_rows(camera_gradients))
+        if unknown_blocks is not None:
+            rows[:, tangents:] = forward(self._lower[:, None], unknown_blocks)
+        if self._has_pairs:
+            rows[..., self._second] += (self._first_to_second[:, None] * rows[..., self._first].unsqueeze(-2)).sum(-3)
+        return rows.flatten(2), self.forward_solve(gradient).flatten(1)
 
 
 def _fill_camera_rows(rows: Tensor, lower: Tensor, blocks: Tensor, points: Tensor) -> None:
-    """``(L^-1 N B(X))^T`` into (B, C', 6, 3, n): the forward substitution of N's columns, then the rotations."""
+    """Write ``(L^-1 N_c B(X))^T`` into rows (B, C', 6, 3, n): forward substitution of N_c's columns, then the rotation rows."""
     r0, l10, l20, r1, l21, r2 = lower[:, None, None].unbind(-2)
     x, y, z = rows[:, :, :3].unbind(3)
     torch.mul(blocks[:, :, :3], r0, out=x)
@@ -87,4 +99,4 @@ def _fill_camera_rows(rows: Tensor, lower: Tensor, blocks: Tensor, points: Tenso
     y.addcmul_(x, l10, value=-1).mul_(r1)
     z[:, :, 0], z[:, :, 1:] = blocks[:, :, 2], blocks[:, :, 4:]
     z.addcmul_(x, l20, value=-1).addcmul_(y, l21, value=-1).mul_(r2)
-    add_rotations(rows, points)
+    add_rotation_rows(rows, points)

@@ -1,9 +1,9 @@
-"""Elimination of points that losses couple over time: block-banded in the frames, exact and linear in their number.
+"""Elimination of tracks: points that losses couple over time. It is exact, and its cost is linear in the number of frames.
 
-A second difference couples three consecutive frames, so with two frames to a block a track's Hessian is block
-tridiagonal. It is factored by cyclic reduction: every second block is eliminated at once, all tracks side by side, and
-what is left is block tridiagonal again with half as many blocks. Points that losses couple within a frame, as the ends of a
-stick, form one track.
+A second difference couples three consecutive frames. With two frames per block the Hessian of a track is therefore block
+tridiagonal. It is factored by cyclic reduction: all odd blocks of all tracks are eliminated at once. A block tridiagonal matrix
+with half as many blocks remains, and is reduced in the same way. Points that losses couple within a frame, such as the ends of
+a stick, form one track.
 """
 
 from __future__ import annotations
@@ -14,23 +14,26 @@ import torch
 from torch import Tensor
 
 from torchstickcal.geometry.symmetric import expand
-from torchstickcal.solvers.elimination.cross_blocks import cross_rows, twist_rows
+from torchstickcal.solvers.elimination.cross_blocks import cross_rows, rotation_curvature_rows
 
 
 class _Level(NamedTuple):
-    """One elimination: the inverse factors of the odd blocks and their coupling to the even blocks left and right."""
+    """One level of the cyclic reduction, in which the odd blocks are eliminated."""
 
     inverse: Tensor
+    """inverses L^-1 of the Cholesky factors of the odd blocks"""
     left: Tensor
+    """L^-1 times the block between an odd block and the even block before it"""
     right: Tensor
+    """L^-1 times the block between an odd block and the even block after it"""
 
 
 class BlockTridiagonal:
-    """Cholesky factor of symmetric, positive definite, block tridiagonal matrices, under a permutation of the blocks.
+    """Cholesky factor L of symmetric, positive definite, block tridiagonal matrices. Blocks are in the order of elimination.
 
     Args:
-        diagonal: (..., G, m, m).
-        below: block (g + 1, g) at index g, (..., G - 1, m, m).
+        diagonal: the G diagonal blocks, (..., G, m, m).
+        below: the blocks below the diagonal, block (g + 1, g) at index g, (..., G - 1, m, m).
     """
 
     def __init__(self, diagonal: Tensor, below: Tensor) -> None:
@@ -47,8 +50,8 @@ class BlockTridiagonal:
             self._levels.append(_Level(inverse, left, right))
         self._last = _inverse_factor(diagonal)
 
-    def half_solve(self, rhs: Tensor) -> list[Tensor]:
-        """``L^-1 b`` of right-hand sides (..., G, m, k), the blocks in their order of elimination, level by level."""
+    def forward_solve(self, rhs: Tensor) -> list[Tensor]:
+        """``L^-1 b`` for right-hand sides b, (..., G, m, k): one tensor per level, in the order of elimination."""
         solved: list[Tensor] = []
         for level in self._levels:
             odd = level.inverse @ rhs[..., 1::2, :, :]
@@ -59,8 +62,8 @@ class BlockTridiagonal:
             solved.append(odd)
         return [*solved, self._last @ rhs]
 
-    def back_solve(self, solved: list[Tensor]) -> Tensor:
-        """``L^-T y`` (..., G, m, k) of what :meth:`half_solve` returned."""
+    def backward_solve(self, solved: list[Tensor]) -> Tensor:
+        """``L^-T y`` (..., G, m, k), for y as returned by :meth:`forward_solve`."""
         x = self._last.mT @ solved[-1]
         for level, y in zip(reversed(self._levels), reversed(solved[:-1]), strict=True):
             count = level.right.shape[-3]
@@ -73,20 +76,21 @@ class BlockTridiagonal:
 
 
 def _inverse_factor(blocks: Tensor) -> Tensor:
-    """Inverses of the Cholesky factors of blocks (..., m, m); NaN for blocks that are not positive definite."""
+    """Inverses of the Cholesky factors of the blocks (..., m, m); NaN for blocks that are not positive definite."""
     identity = torch.eye(blocks.shape[-1], dtype=blocks.dtype, device=blocks.device).expand_as(blocks)
     factor, failed = torch.linalg.cholesky_ex(blocks)
     return torch.linalg.solve_triangular(factor, identity, upper=False).where(failed[..., None, None] == 0, torch.nan)
 
 
 class TrackElimination:
-    """Cholesky factor of the points' Hessian for T tracks of q points each that losses couple, within frames or over time.
+    """Cholesky factor L of the points' Hessian for T tracks, with q points per track and frame.
 
     Args:
-        hessian: diagonal blocks (B, 6, T, F, q) of the points, entries xx xy xz yy yz zz, the losses' shares included.
-        within: (B, T, F, 3 q, 3 q), blocks between different points of a frame, zero on the diagonal; None where q is 1.
-        between: multiples of the identity that couple frames f and f + 1, (B, F - 1, T, q), and f and f + 2,
-            (B, F - 2, T, q); None where frames are not coupled, and each is eliminated by itself.
+        hessian: diagonal blocks, (B, 6, T, F, q), entries xx xy xz yy yz zz. They include all losses.
+        within: blocks between different points of a track in one frame, (B, T, F, 3 q, 3 q), zero on the diagonal; None if q is
+            1.
+        between: the blocks between frames f and f + 1, (B, F - 1, T, q), and between f and f + 2, (B, F - 2, T, q), as factors
+            of the identity; None if no loss couples frames. Each frame is then eliminated independently.
     """
 
     def __init__(self, hessian: Tensor, within: Tensor | None, between: tuple[Tensor, Tensor] | None) -> None:
@@ -96,31 +100,36 @@ class TrackElimination:
         sessions, tracks, frames, _, _ = diagonal.shape
         if between is None:
             tracks, frames = tracks * frames, 1
-            nothing = hessian.new_zeros(sessions, 0, tracks, hessian.shape[-1])
-            between = nothing, nothing
+            empty = hessian.new_zeros(sessions, 0, tracks, hessian.shape[-1])
+            between = empty, empty
         self._shape = tracks, frames, hessian.shape[-1]
         by_track = diagonal.reshape(sessions * tracks, frames, *diagonal.shape[-2:])
-        steps = (step.transpose(1, 2).flatten(0, 1).repeat_interleave(3, -1) for step in between)
-        self._factor = BlockTridiagonal(*_two_frames_a_block(by_track, *steps))
+        couplings = (factors.transpose(1, 2).flatten(0, 1).repeat_interleave(3, -1) for factors in between)
+        self._factor = BlockTridiagonal(*_two_frames_per_block(by_track, *couplings))
 
-    def reductions(
-        self, cross: Tensor, points: Tensor, gradient: Tensor, twist: Tensor | None = None, coupling: Tensor | None = None
+    def forward_solve_cross(
+        self,
+        camera_blocks: Tensor,
+        points: Tensor,
+        gradient: Tensor,
+        camera_gradients: Tensor | None = None,
+        unknown_blocks: Tensor | None = None,
     ) -> tuple[Tensor, Tensor]:
-        """``(L^-1 H_xc)^T`` and ``L^-1 g`` of :class:`PointElimination`, the unknowns in the order of elimination."""
-        rows = cross_rows(cross, points)
-        if twist is not None:
-            rows[:, :, 3:] += twist_rows(twist)
+        """As :meth:`PointElimination.forward_solve_cross`, but with the columns in the order of elimination."""
+        rows = cross_rows(camera_blocks, points)
+        if camera_gradients is not None:
+            rows[:, :, 3:] += rotation_curvature_rows(camera_gradients)
         rows = rows.flatten(1, 2)
-        if coupling is not None:
-            rows = torch.cat([rows, coupling], dim=1)
-        levels = self._factor.half_solve(self._blocks(torch.cat([rows, gradient[:, None]], dim=1)))
+        if unknown_blocks is not None:
+            rows = torch.cat([rows, unknown_blocks], dim=1)
+        levels = self._factor.forward_solve(self._blocks(torch.cat([rows, gradient[:, None]], dim=1)))
         solved = torch.cat([level.unflatten(0, (len(rows), -1)).flatten(1, -2) for level in levels], dim=1).mT
         return solved[:, :-1], solved[:, -1]
 
     def solve(self, rhs: Tensor) -> Tensor:
-        """``H^-1 b`` of a right-hand side (B, 3, n)."""
+        """``H^-1 b`` for right-hand sides b, (B, 3, n)."""
         tracks, frames, points = self._shape
-        solved = self._factor.back_solve(self._factor.half_solve(self._blocks(rhs[:, None])))
+        solved = self._factor.backward_solve(self._factor.forward_solve(self._blocks(rhs[:, None])))
         by_frame = solved.reshape(len(rhs), tracks, -1, points, 3)[:, :, :frames]
         return by_frame.permute(0, 4, 1, 2, 3).flatten(2)
 
@@ -134,14 +143,17 @@ class TrackElimination:
 
 
 def _block_diagonal(entries: Tensor) -> Tensor:
-    """The blocks (B, T, F, 3 q, 3 q) with the symmetric matrices of entries (B, 6, T, F, q) on the diagonal."""
+    """Block diagonal matrices (B, T, F, 3 q, 3 q) of the symmetric 3 x 3 matrices with entries (B, 6, T, F, q)."""
     blocks = expand(entries.flatten(2)).unflatten(-1, entries.shape[2:])
-    own = torch.eye(entries.shape[-1]).to(entries)
-    return torch.einsum("bijtfq,qr->btfqirj", blocks, own).flatten(-2).flatten(-3, -2)
+    same_point = torch.eye(entries.shape[-1]).to(entries)
+    return torch.einsum("bijtfq,qr->btfqirj", blocks, same_point).flatten(-2).flatten(-3, -2)
 
 
-def _two_frames_a_block(diagonal: Tensor, next_frame: Tensor, second_frame: Tensor) -> tuple[Tensor, Tensor]:
-    """Block tridiagonal form of tracks with diagonal (T, F, m, m) and couplings (T, F - 1, m), (T, F - 2, m)."""
+def _two_frames_per_block(diagonal: Tensor, next_frame: Tensor, second_frame: Tensor) -> tuple[Tensor, Tensor]:
+    """Block tridiagonal form of T tracks with diagonal blocks (T, F, m, m) and couplings (T, F - 1, m) and (T, F - 2, m).
+
+    An odd number of frames is padded with an identity block.
+    """
     tracks, frames, m, _ = diagonal.shape
     if frames % 2:
         padding = torch.eye(m, dtype=diagonal.dtype, device=diagonal.device).expand(tracks, 1, m, m)
