@@ -15,7 +15,7 @@ from torchstickcal.pipeline.conclude import conclude
 from torchstickcal.pipeline.run import Run
 from torchstickcal.pipeline.session import Session
 from torchstickcal.result import Calibration
-from torchstickcal.solvers import IterationRecord, unheard
+from torchstickcal.solvers import IterationRecord, ignore_record
 from torchstickcal.workers import on_worker
 
 
@@ -72,7 +72,7 @@ def calibrate(
 
 def _calibrated(observations: Observations, config: Config, callback: Callback | None) -> Calibration:
     began = time.perf_counter()
-    run = Run(config, callback.on_iteration if callback else unheard)
+    run = Run(config, callback.on_iteration if callback else ignore_record)
     session = Session(observations, run)
 
     # 1. Synchronise: where the cameras' frames clearly do not belong together, find the time offsets.

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 from torchstickcal.config import Config, Stage
-from torchstickcal.solvers import Listener, unheard
+from torchstickcal.solvers import Listener, ignore_record
 
 
 @dataclass(frozen=True)
@@ -19,7 +19,7 @@ class Run:
     """
 
     config: Config
-    listener: Listener = unheard
+    listener: Listener = ignore_record
     seconds: dict[str, float] = field(default_factory=dict)
 
     @property

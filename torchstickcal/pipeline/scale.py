@@ -82,7 +82,7 @@ def scale_factors(measurements: Measurements, points: Tensor, known: Sequence[Ru
         expected += ruler.lengths_m * lengths.isfinite().sum(1)
     if not bool((measured > 0).all()):
         raise ObservationError(
-            "the length that sets the scale is never seen whole",
+            "the points whose distance sets the scale are never reconstructed in the same frame",
             where="scale",
             got="no frame",
             expected="a frame in which all its points are seen by two cameras",

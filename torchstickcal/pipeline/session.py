@@ -18,7 +18,7 @@ from torchstickcal.pipeline.synchronise import ClockEstimate, on_common_frames, 
 
 _MAX_STARTS = 3
 _FAR_FRAMES = 0.75
-"""Time offset from the frames chosen, in frames, from which on other frames are nearer."""
+"""Remaining time offset, in frames, from which on a camera's frames are chosen anew."""
 _FITTING_SHARE, _FITTING_FOCAL_SHARE = 0.6, 0.01
 """Least fraction of inliers, and largest noise as a fraction of the focal length, of cameras that fit together."""
 
@@ -119,7 +119,7 @@ class Session:
         return self._at_nearest_frames(adjust_again(adjustment, self._run, refined))
 
     def _at_nearest_frames(self, adjustment: Adjustment) -> Adjustment:
-        """Adjusted from the beginning where the time offsets found say that other frames are nearer to the common frames."""
+        """Adjusted anew with other frames, where the estimated time offsets say that those are closer in time."""
         for _ in range(_MAX_STARTS - 1):
             remaining = adjustment.remaining_offsets_frames
             if not bool((remaining.abs() > _FAR_FRAMES).any()):

@@ -1,4 +1,4 @@
-"""A calibration told to a person, as a table, and to a program, as JSON."""
+"""A calibration as a table for people, and as JSON for programs."""
 
 from __future__ import annotations
 

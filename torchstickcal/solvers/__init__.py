@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from torchstickcal.solvers.base import IterationRecord, Listener, Outcome, Solver, StageRecord, Stop, Termination, unheard
+from torchstickcal.solvers.base import IterationRecord, Listener, Outcome, Solver, StageRecord, Stop, Termination, ignore_record
 from torchstickcal.solvers.gauss_newton import gauss_newton
 
 __all__ = [
@@ -15,8 +15,8 @@ __all__ = [
     "Stop",
     "Termination",
     "gauss_newton",
+    "ignore_record",
     "solver",
-    "unheard",
 ]
 
 SOLVERS = ("gauss_newton", "lbfgs")

@@ -77,7 +77,7 @@ class StageRecord:
 Listener = Callable[[IterationRecord], None]
 
 
-def unheard(record: IterationRecord) -> None:
+def ignore_record(record: IterationRecord) -> None:
     """A listener that ignores the record."""
 
 
