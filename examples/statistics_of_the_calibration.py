@@ -1,21 +1,23 @@
-"""Is the covariance honest, and is the estimate as good as it can be? Statistics of many simulated sessions.
+"""Are the reported standard deviations right, and is the calibration as accurate as possible? Statistics of simulated sessions.
 
     python examples/statistics_of_the_calibration.py                 # 2 runs of each: a few seconds
     python examples/statistics_of_the_calibration.py --runs 500      # the tables of docs/uncertainty.md
 
-Every run draws a motion, the random part of a rig, keypoint noise of 1 px and, where the table says so, gross errors of up to
-150 px along each axis. Printed with their standard errors over the runs:
+Each run simulates another motion and another random part of the rig, with keypoint noise of 1 px and, in half of the rows,
+outliers of up to 150 px along each axis. The tables have means over the runs with their standard errors.
 
-Honesty. e2/n is the squared error in units of the covariance per degree of freedom, 1 where the covariance is honest: of all
-cameras together, of fresh points that the calibrated cameras triangulate, and of the session's own points. "Inside" is the
-share of true values inside the 95 % ellipsoid (of all cameras; of each fresh point) or interval (each coordinate of a fresh
-point, by ``predict_std``).
+First table: are the standard deviations right? The normalised squared error is the squared error divided by the reported
+variance, per degree of freedom. It is 1 if the reported variance is right. It is printed for all cameras together, for new
+points that the calibrated cameras triangulate, and for the points of the session. "Inside 95 %" is the share of the true values
+inside the reported 95 % region: ellipsoid of all cameras, ellipsoid of each new point, interval of each coordinate of a new
+point by ``predict_std``.
 
-A run in which most keypoints of some camera were set aside is lost, as its user can see; lost runs are counted and left out.
+A run has failed if more than half of the keypoints of a camera were rejected. Failed runs are counted and left out.
 
-Efficiency. Mean squared error of the camera centres and rotations, in the first camera's frame, over that of the Cramer-Rao
-bound for those who know the inliers, their noise and the stick's length exactly. "Less luck" removes the luck of the draw:
-the linear estimate that attains the bound is computed from the same keypoints, and its surplus over the bound subtracted.
+Second table: is the calibration as accurate as possible? The mean squared error of the camera centres and rotations, in the
+first camera's frame, is divided by the Cramér-Rao bound of a method that knows the inliers, their noise and the stick's length
+exactly. "Corrected for chance" is the same with less scatter: the best linear estimate, which attains the bound, is computed
+from the same keypoints, and the difference between its squared error and the bound is subtracted.
 """
 
 from __future__ import annotations
@@ -50,7 +52,7 @@ RIGS = (
     SessionSpec("hockey, ring", "hockey", cameras=5, frames=40, fps=20.0, layout="ring"),
     SessionSpec("baseball, arena", "baseball", cameras=8, frames=40, fps=20.0, layout="arena"),
 )
-FRESH_POINTS, FRESH_RADIUS_M, SCENE_CENTRE = 50, 0.9, (0.0, 0.0, 0.9)
+NEW_POINTS, NEW_RADIUS_M, SCENE_CENTRE = 50, 0.9, (0.0, 0.0, 0.9)
 INTERVAL_95 = 1.959964
 
 
@@ -71,7 +73,7 @@ class Squared(NamedTuple):
 class Run(NamedTuple):
     """What one run contributes: means over its cameras or points, and sums of squares."""
 
-    lost: bool
+    failed: bool
     cameras: float
     cameras_inside: float
     points: float
@@ -80,7 +82,7 @@ class Run(NamedTuple):
     own_points: float
     found: Squared
     best: Squared
-    """of the linear estimate that attains the bound"""
+    """of the best linear estimate, which attains the bound"""
     bound: Squared
 
 
@@ -88,23 +90,28 @@ def main() -> None:
     """Print the tables."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--runs", type=int, default=2)
-    parser.add_argument("--outliers", type=float, nargs="+", default=[0.0, 0.1], help="shares of gross errors")
-    parser.add_argument("--stick-sigma-m", type=float, default=0.001, help="how well the calibration takes the length to hold")
+    parser.add_argument("--outliers", type=float, nargs="+", default=[0.0, 0.1], help="shares of outliers, 0 to 1")
+    parser.add_argument("--stick-sigma-m", type=float, default=0.001, help="standard deviation of the length")
     options = parser.parse_args()
     config = _with_stick_sigma(options.stick_sigma_m)
-    honesty, efficiency = [], []
+    consistency, efficiency = [], []
     for share in options.outliers:
         for rig in RIGS:
             spec = replace(rig, regimes=(Noise(SIGMA_PX, outliers=share),))
             every = [one_run(replace(spec, seed=seed), config) for seed in range(options.runs)]
-            runs = [run for run in every if not run.lost]
+            runs = [run for run in every if not run.failed]
             label = f"| {rig.cameras} | {rig.name} | {share:.0%} | {len(every)} | {len(every) - len(runs)} | "
-            honesty.append(label + _honesty(runs))
+            consistency.append(label + _consistency(runs))
             efficiency.append(label + _efficiency(runs))
-    first = "| cameras | action, layout | outliers | runs | lost | "
-    print(first + "cameras e2/n | inside | points e2/n | inside | coordinates inside | own points e2/n |\n" + "|---" * 11 + "|")
-    print("\n".join(honesty))
-    print("\n" + first + "centres / bound | less luck | rotations / bound | less luck |\n" + "|---" * 9 + "|")
+    first = "| cameras | sport, layout | outliers | runs | failed | "
+    print(
+        f"{first}cameras: normalised squared error | cameras inside 95 % | new points: normalised squared error "
+        "| new points inside 95 % | new coordinates inside 95 % | session's points: normalised squared error |"
+    )
+    print("|---" * 11 + "|")
+    print("\n".join(consistency))
+    print(f"\n{first}centres: error / bound | corrected for chance | rotations: error / bound | corrected for chance |")
+    print("|---" * 9 + "|")
     print("\n".join(efficiency))
 
 
@@ -115,12 +122,12 @@ def one_run(spec: SessionSpec, config: dict[str, object]) -> Run:
     truth = true_poses(session)
     error = deviation(calibration, truth)
     squared = float(error @ torch.linalg.solve(calibration.covariance, error))
-    points, coordinates = errors_of_fresh_points(calibration, session, truth)
+    points, coordinates = errors_of_new_points(calibration, session, truth)
     own = (calibration.points - true_points(session)).square().sum(-1) / calibration.points_std_m.square()
     best, covariance = best_estimate(session, truth)
     centres = se3.camera_centres(*truth)
     return Run(
-        lost=bool((calibration.inliers.sum((1, 2)) < session.observations.visible.sum((1, 2)) / 2).any()),
+        failed=bool((calibration.inliers.sum((1, 2)) < session.observations.visible.sum((1, 2)) / 2).any()),
         cameras=squared / len(error),
         cameras_inside=float(squared < chi_square_quantile(0.95, len(error))),
         points=float(points.mean()) / 3,
@@ -165,11 +172,11 @@ def squared_errors(poses: Poses, truth: Poses) -> Squared:
     return Squared(float(centres.square().sum()), float(angles.square().sum()))
 
 
-def errors_of_fresh_points(calibration: Calibration, session: SimulatedSession, truth: Poses) -> tuple[Tensor, Tensor]:
-    """Errors of fresh points: squared, in units of the covariance (N,), and by coordinate, of ``predict_std`` (N, 3)."""
+def errors_of_new_points(calibration: Calibration, session: SimulatedSession, truth: Poses) -> tuple[Tensor, Tensor]:
+    """Errors of new points: squared and divided by the covariance (N,), and by coordinate over ``predict_std`` (N, 3)."""
     generator = torch.Generator().manual_seed(zlib.crc32(session.observations.keypoints.numpy().tobytes()))
-    direction = torch.nn.functional.normalize(torch.randn(FRESH_POINTS, 3, generator=generator, dtype=torch.float64), dim=1)
-    distance = FRESH_RADIUS_M * torch.rand(FRESH_POINTS, 1, generator=generator, dtype=torch.float64) ** (1 / 3)
+    direction = torch.nn.functional.normalize(torch.randn(NEW_POINTS, 3, generator=generator, dtype=torch.float64), dim=1)
+    distance = NEW_RADIUS_M * torch.rand(NEW_POINTS, 1, generator=generator, dtype=torch.float64) ** (1 / 3)
     world = torch.tensor(SCENE_CENTRE, dtype=torch.float64) + distance * direction
     points = world @ session.truth.rotations[0].mT + session.truth.translations[0]
     lenses = session.observations.cameras
@@ -177,8 +184,8 @@ def errors_of_fresh_points(calibration: Calibration, session: SimulatedSession, 
     keypoints = seen + SIGMA_PX * torch.randn(seen.shape, generator=generator, dtype=torch.float64)
     poses = Poses(calibration.rotations, calibration.translations)
     found = triangulated_by_least_squares(keypoints, poses, session.observations)
-    sigma_px = calibration.sigma_px.median().expand(FRESH_POINTS)
-    visible = torch.ones(len(keypoints), FRESH_POINTS, dtype=torch.bool)
+    sigma_px = calibration.sigma_px.median().expand(NEW_POINTS)
+    visible = torch.ones(len(keypoints), NEW_POINTS, dtype=torch.bool)
     covariances = point_covariances(found, visible, sigma_px, poses, lenses, calibration.covariance)
     error = points - found
     squared = (error[:, None] @ torch.linalg.solve(covariances, error[..., None]))[:, 0, 0]
@@ -186,7 +193,7 @@ def errors_of_fresh_points(calibration: Calibration, session: SimulatedSession, 
 
 
 def triangulated_by_least_squares(keypoints: Tensor, poses: Poses, observations: Observations) -> Tensor:
-    """Points (N, 3) of keypoints (C, N, 2) by least squares in the image, the cameras held."""
+    """Points (N, 3) of keypoints (C, N, 2) by least squares in the image, with fixed cameras."""
     measurements = Measurements.of(Observations(keypoints[:, :, None], observations.intrinsics, []))
     rotations, translations = poses.rotations[None], poses.translations[None]
     start = State.of(rotations, translations, triangulated(measurements, rotations, translations, InitialiseSettings()))
@@ -224,7 +231,7 @@ def _with_stick_sigma(sigma_m: float) -> dict[str, object]:
     return {"extends": "default", "stages": {stage: {"stick_length": {"sigma_m": sigma_m}} for stage in stages}}
 
 
-def _honesty(runs: Sequence[Run]) -> str:
+def _consistency(runs: Sequence[Run]) -> str:
     columns = torch.tensor([run[1:7] for run in runs], dtype=torch.float64).mT
     shares = (False, True, False, True, True, False)
     return " | ".join(_mean(values, share) for values, share in zip(columns, shares, strict=True)) + " |"
