@@ -1,11 +1,12 @@
-"""Time the adjustment of cameras and points against other adjusters, on one problem from one start.
+"""Measure the time of bundle adjustment, and compare it with other programs on the same problem.
 
     python examples/benchmark_adjustment.py                    # 8 cameras, 50 frames: a few seconds
     python examples/benchmark_adjustment.py --frames 1000 6000 --cameras 8 --runs 5
 
-Every adjuster gets the same keypoints, the same start and the same noise, and stops when an iteration lowers the cost by less
-than 1e-6 of it; the table shows what it reached. Peers that are not installed are left out, and named:
-``pip install pycolmap gtsam scipy``. Times are medians over the runs, of the call that adjusts, without building its problem.
+Every program gets the same keypoints, starts from the same values with the same noise, and stops when an iteration decreases
+the cost by less than 1e-6 of it. The table shows the cost that it reached. Programs that are not installed are skipped, and
+named: ``pip install pycolmap gtsam scipy``. Times are medians over the runs, of the adjustment alone, without the time to set
+up the problem.
 """
 
 from __future__ import annotations
@@ -41,7 +42,7 @@ Array = NDArray[np.float64]
 
 
 class Problem(NamedTuple):
-    """Keypoints of a simulated scene and a start near the truth."""
+    """Keypoints of a simulated scene, and initial values near the truth."""
 
     pixels: Tensor
     """(C, 2, N)"""
@@ -61,7 +62,7 @@ class Timing(NamedTuple):
 
 
 def simulated(cameras: int, frames: int, points: int) -> Problem:
-    """A ring of cameras around points that wander; the last two are the ends of a stick of 1 m; 1 px of noise."""
+    """A ring of cameras around points that move randomly; the last two are the ends of a stick of 1 m; noise of 1 px."""
     rng = np.random.default_rng(0)
     angles = 2 * np.pi * np.arange(cameras) / cameras
     centres = np.stack([4.5 * np.cos(angles), 4.5 * np.sin(angles), 1.5 + 0.5 * (np.arange(cameras) % 3)], axis=1)
@@ -76,8 +77,9 @@ def simulated(cameras: int, frames: int, points: int) -> Problem:
     poses = torch.from_numpy(rotations)[None], torch.from_numpy(translations)[None]
     pixels = lenses.project(se3.moved(*poses, points_m[None])[0].movedim(1, -1)).movedim(-1, 1)
     pixels = (pixels + torch.from_numpy(rng.normal(0, 1, pixels.shape))).contiguous()
-    knock = torch.from_numpy(rng.normal(0, 0.003, (cameras - 1, 6)))
-    start = State.of(*poses, points_m[None]).retracted(knock[None], torch.from_numpy(rng.normal(0, 0.01, points_m.shape))[None])
+    tangents = torch.from_numpy(rng.normal(0, 0.003, (cameras - 1, 6)))
+    shifts = torch.from_numpy(rng.normal(0, 0.01, points_m.shape))
+    start = State.of(*poses, points_m[None]).retracted(tangents[None], shifts[None])
     return Problem(pixels, lenses, frames, start.rotations[0], start.translations[0], start.points[0])
 
 
@@ -234,8 +236,8 @@ ADJUSTERS: dict[str, tuple[str | None, Callable[[Problem], Timing]]] = {
     "GTSAM": ("gtsam", gtsam_lm),
     "scipy least_squares": ("scipy", scipy_trf),
 }
-SLOW_PEERS = {"GTSAM": 50_000, "scipy least_squares": 50_000}
-"""Largest number of keypoints these are asked to adjust."""
+SLOW_PROGRAMS = {"GTSAM": 50_000, "scipy least_squares": 50_000}
+"""Largest number of keypoints with which these slow programs are run."""
 
 
 def main() -> None:
@@ -266,8 +268,8 @@ def _compare(cameras: int, frames: int, points: int, runs: int) -> None:
         if module is not None and importlib.util.find_spec(module) is None:
             print(f"{label} not installed: {module}")
             continue
-        if keypoints > SLOW_PEERS.get(name, keypoints):
-            print(f"{label} left out: too slow at this size")
+        if keypoints > SLOW_PROGRAMS.get(name, keypoints):
+            print(f"{label} skipped: too slow for this number of keypoints")
             continue
         timings = [adjust(problem) for _ in range(runs)]
         seconds = statistics.median(timing.seconds for timing in timings)

@@ -1,4 +1,4 @@
-"""How long the layer takes: a batch of sessions against single calls, and the way back against an iteration of Gauss-Newton.
+"""Measure the time of the layer: one batch against single calls, and the backward pass against a Gauss-Newton iteration.
 
 python examples/benchmark_layer.py --sessions 64
 """
@@ -47,11 +47,11 @@ def main() -> None:
         every = list(zip(keypoints, starts, strict=True))
         return _median(lambda: [layer(k + 0.5, lens, initial=start) for k, start in every], options.runs, keypoints)
 
-    print(f"{'forward':24} {'singles s':>10} {'batch s':>10} {'ratio':>7}")
-    for name, warm in (("cold", False), ("warm start", True)):
+    print(f"{'forward pass':24} {'single calls (s)':>16} {'one batch (s)':>14} {'ratio':>7}")
+    for name, warm in (("cold start", False), ("warm start", True)):
         with torch.no_grad():
             alone, together = singles(warm), batch(warm)
-        print(f"{name:24} {alone:10.3f} {together:10.3f} {together / alone:6.2f}x")
+        print(f"{name:24} {alone:16.3f} {together:14.3f} {together / alone:6.2f}x")
 
     leaf = keypoints[0].clone().requires_grad_()
     stages = {name: stage for name, stage in load_config("default").stages.items() if stage.cameras == "free"}
@@ -71,7 +71,8 @@ def main() -> None:
 
     one = _median(lambda: on_worker(keypoints.device, iteration), 10 * options.runs, keypoints)
     print(
-        f"\nbackward, tracks not smoothed: {1e3 * back:.1f} ms, {back / one:.1f} Gauss-Newton iterations of {1e3 * one:.1f} ms"
+        f"\nbackward pass, without smoothness: {1e3 * back:.1f} ms, "
+        f"as long as {back / one:.1f} Gauss-Newton iterations of {1e3 * one:.1f} ms"
     )
 
 

@@ -1,7 +1,7 @@
 """Use the losses and the extrinsics in a training loop of your own, with any optimiser of torch.optim.
 
-The cameras of a calibrated rig were moved a little. Adam estimates their poses and the athlete's points again from new
-keypoints. A network that predicts keypoints or points could take their place.
+The cameras of a calibrated rig have moved a little. Adam estimates their poses and the points of the athlete from new
+keypoints. A network that predicts keypoints or points could replace these parameters.
 """
 
 import torch
@@ -18,9 +18,9 @@ STEPS = 600
 session, truth = golf_session(cameras=4, frames=60, noise=Noise(sigma_px=1.0))
 assert truth.points is not None
 torch.manual_seed(0)
-knock = 0.02 * torch.randn(4, 6, dtype=torch.float64)
-knock[0] = 0.0
-extrinsics = Extrinsics(*se3.retract(truth.rotations, truth.translations, knock))
+perturbation = 0.02 * torch.randn(4, 6, dtype=torch.float64)
+perturbation[0] = 0.0
+extrinsics = Extrinsics(*se3.retract(truth.rotations, truth.translations, perturbation))
 points = nn.Parameter(truth.points + 0.05 * torch.randn_like(truth.points))
 
 reprojection = ReprojectionLoss(sigma=1.0, kernel=Cauchy(3.0))

@@ -1,1 +1,1 @@
-"""What the joint training example is made of: the scenes it sees and the detector it trains."""
+"""The parts of the joint training example: the scenes and the detector."""

@@ -1,4 +1,4 @@
-"""A small keypoint detector: heatmaps of an encoder and decoder, read out as coordinates and a confidence."""
+"""A small keypoint detector: heatmaps of an encoder and decoder, turned into coordinates and a confidence."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from torch import Tensor, nn
 
 
 class Detector(nn.Module):
-    """Keypoints of images of one installation: one network, and a correction for each camera and point.
+    """Keypoints in the images of fixed cameras: one network for all, and a correction for each camera and point.
 
     Args:
         cameras: C.
@@ -29,14 +29,14 @@ class Detector(nn.Module):
         self.doubt = nn.Parameter(torch.tensor(-3.0))
 
     def keep_trunk(self) -> None:
-        """Leave the layers that all cameras share as they are from now on."""
+        """Stop training the layers that all cameras share."""
         for layers in (self.fine, self.middle, self.coarse, self.joined, self.head):
             layers.requires_grad_(False)
 
     def forward(self, images: Tensor) -> tuple[Tensor, Tensor]:
         """Keypoints (S, C, F, P, 2), pixels, and confidence (S, C, F, P) of images (S, C, F, 3, H, W).
 
-        The confidence falls with the spread of the heatmap, as fast as the network has learnt.
+        The confidence decreases with the spread of the heatmap. The network learns how fast.
         """
         middle = self.middle(self.fine(images.flatten(0, 2)))
         wide = nn.functional.interpolate(self.coarse(middle), scale_factor=2.0)

@@ -1,4 +1,4 @@
-"""Sessions of one venue: athletes and sticks of the simulator, drawn as small colour images, with labels that are wrong."""
+"""Sessions of fixed cameras: athletes and sticks of the simulator, drawn as small colour images, with labels that are wrong."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from torchstickcal.simulate.skeleton import JOINT_INDEX, JOINTS, PARENTS, Skelet
 
 CAMERAS, SIZE = 6, 64
 SWINGS, FRAMES = 4, 8
-"""Of a session: actions, and pictures of each."""
+"""Number of actions of a session, and of images of each action."""
 SPORTS = ("golf", "baseball", "hockey", "kendo")
 SIDES = ("left", "right")
 TRACKED = ("head", *(f"{side}_{joint}" for side in SIDES for joint in ("shoulder", "elbow", "hand", "knee", "ankle")))
@@ -33,18 +33,18 @@ _AT_ONCE = 72
 
 @dataclass(frozen=True)
 class Sessions:
-    """S sessions of F frames in all, seen by the C cameras of the venue."""
+    """S sessions of F frames, seen by the C cameras of the venue."""
 
     images: Tensor
     """(S, C, F, 3, H, W), 0 to 1"""
     keypoints: Tensor
-    """(S, C, F, P, 2), where the points are, pixels"""
+    """(S, C, F, P, 2), true keypoints, pixels"""
 
 
 class Venue:
-    """A fixed rig, what clutters its pictures, and what its annotators get wrong.
+    """A fixed rig, the background of its images, and the errors of its labels.
 
-    In two views of each point, other ones for every point, the labels are off by one vector throughout.
+    The labels of each point have a constant error in two views. These views differ from point to point.
     """
 
     def __init__(self, seed: int = 0) -> None:
@@ -57,7 +57,7 @@ class Venue:
         self._bias = _bias(rng)
 
     def sessions(self, first: int, count: int) -> Sessions:
-        """Sessions ``first`` to ``first + count``; in each of their swings sport, athlete and motion differ."""
+        """Sessions ``first`` to ``first + count``. Sport, athlete and motion differ from action to action."""
         swings = range(first * SWINGS, (first + count) * SWINGS)
         images, keypoints = zip(*map(self._swing, swings), strict=True)
 
@@ -74,13 +74,13 @@ class Venue:
         return (_drawn(pixels, self._background) + noise).clamp(0, 1), pixels[:, :, _CHOSEN]
 
     def labels(self, sessions: Sessions, seed: int) -> Tensor:
-        """What the annotators say, (S, C, F, P, 2)."""
+        """Labels with their errors, (S, C, F, P, 2)."""
         scatter = torch.randn(sessions.keypoints.shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
         return sessions.keypoints + self._bias[:, None] + _SCATTER_PX * scatter
 
 
 def stick() -> Stick:
-    """The stick that all sessions have, their own being brought to its length."""
+    """The stick of all sessions; the sticks of the sports are scaled to its length."""
     return Stick(POINTS - 2, POINTS - 1, _STICK_M)
 
 
@@ -91,7 +91,7 @@ _COLOURS = torch.tensor([colorsys.hsv_to_rgb(index / len(_BONES), 0.9, 0.95) for
 
 
 def _points(sport: str, seed: int, height_m: float) -> np.ndarray:
-    """All points (F, P, 3) of an action; the stick's end is drawn in or out to the common length."""
+    """All points (F, P, 3) of an action; the end of the stick is moved so that the stick has the common length."""
     motion = Motion(action(sport), Skeleton(height_m), Path("stay", 0.3), 0.25, 1.0, 1.0, seed)
     points = motion.points(np.arange(FRAMES) / _FPS)
     grip, tip = points[:, -2], points[:, -1]
@@ -100,7 +100,7 @@ def _points(sport: str, seed: int, height_m: float) -> np.ndarray:
 
 
 def _drawn(pixels: Tensor, background: Tensor) -> Tensor:
-    """Limbs and stick over the background (C, 3, H, W), of points (C, F, P, 2); (C, F, 3, H, W)."""
+    """Images (C, F, 3, H, W) of limbs and stick, from points (C, F, P, 2), over a background (C, 3, H, W)."""
     rows, columns = torch.meshgrid(torch.arange(SIZE), torch.arange(SIZE), indexing="ij")
     grid = torch.stack([columns, rows], dim=-1).reshape(-1, 2).float()
     flat = pixels.flatten(0, 1).float()
@@ -122,7 +122,7 @@ def _drawn(pixels: Tensor, background: Tensor) -> Tensor:
 
 
 def _clutter(rng: np.random.Generator) -> Tensor:
-    """Soft blobs of any colour, (C, 3, H, W)."""
+    """A background of soft blobs of random colours, (C, 3, H, W)."""
     rows, columns = np.mgrid[:SIZE, :SIZE]
     picture = np.full((CAMERAS, 3, SIZE, SIZE), 0.35)
     for camera in range(CAMERAS):
@@ -134,7 +134,7 @@ def _clutter(rng: np.random.Generator) -> Tensor:
 
 
 def _bias(rng: np.random.Generator) -> Tensor:
-    """By what the labels of each view are off, (C, P, 2)."""
+    """The constant errors of the labels, (C, P, 2)."""
     bias = np.zeros((CAMERAS, POINTS, 2))
     for point in range(POINTS):
         views = rng.choice(CAMERAS, _DISPLACED_VIEWS, replace=False)

@@ -1,15 +1,16 @@
 """aniposelib-pytorch: its recipe for calibration from keypoints without a board, scaled by the stick.
 
-``aniposelib.init.calibrate_from_points`` as its README gives it ("Keypoint self-calibration"): structure from motion, robust
-adjustment of the extrinsics, then the scale of ``aniposelib.scale.from_lengths``. That wants three views of a stick end that
-agree; where too few have them it is asked again with two. Its quality report is made afterwards, not timed.
+``aniposelib.init.calibrate_from_points`` as in its README ("Keypoint self-calibration"): structure from motion, robust
+adjustment of the extrinsics, then the scale of ``aniposelib.scale.from_lengths``. The scale needs stick ends on which three
+views agree. If there are too few of them, it is computed from two views. The quality report is made afterwards, and its time is
+not included.
 
-Intrinsics are known and held, as in the recipe; ``ANIPOSE_REFINE`` in the environment lists those that its adjustment frees in
-each camera at the end: ``fx,fy,cx,cy,k1,k2`` is what its adjustment frees by itself outside the recipe, ``f`` one focal length.
+Intrinsics are held fixed, as in the recipe. ``ANIPOSE_REFINE`` in the environment lists those that the adjustment estimates for
+each camera at the end: ``fx,fy,cx,cy,k1,k2`` is the default of its adjustment outside the recipe, ``f`` is one focal length.
 
-Clocks are taken to agree; ``ANIPOSE_CLOCKS=offsets`` has ``aniposelib.stba.SpatiotemporalBA`` go on from there with its own
-options: points on splines, an offset of each camera's clock. ``offsets,readout`` finds the time that each sensor takes to be
-read out, too. The stick's median length on the splines then gives the scale, and no report is made.
+The cameras are assumed to be synchronised. With ``ANIPOSE_CLOCKS=offsets``, ``aniposelib.stba.SpatiotemporalBA`` continues from
+the result with its default options: points on splines, a time offset of each camera. With ``offsets,readout`` it also estimates
+the read-out time of the sensors. The median length of the stick on the splines then gives the scale, and no report is made.
 """
 
 from __future__ import annotations
@@ -59,7 +60,7 @@ def calibrate(session: Session) -> Found:
 
 
 def _with_clocks(session: Session, group: CameraGroup, keypoints: Array) -> CameraGroup:
-    """The cameras adjusted together with their clocks, in metres again."""
+    """The cameras, adjusted together with their clocks and scaled to metres."""
     times = np.arange(keypoints.shape[1]) / session.fps
     observations = TimedObservations.from_dense(keypoints, times)
     found = SpatiotemporalBA(group, observations, rolling_shutter="readout" in CLOCKS).fit()

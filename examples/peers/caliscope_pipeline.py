@@ -1,8 +1,8 @@
 """Caliscope: its whole extrinsic calibration, with the stick as its distance constraint.
 
 ``calibrate_extrinsics`` as its application calls it: bootstrap, adjustment, robust refinement, filter, adjustment. Intrinsics
-are known and held; ``CALISCOPE_REFINE_INTRINSICS=1`` in the environment lets it refine them, as it does by default.
-``CALISCOPE_FILTER_PERCENTILE`` replaces the 2.5 % of the keypoints, those with the largest errors, that its filter drops.
+are held fixed; with ``CALISCOPE_REFINE_INTRINSICS=1`` in the environment it may estimate them, as it does by default.
+``CALISCOPE_FILTER_PERCENTILE`` replaces the 2.5 % of the keypoints, those with the largest errors, that its filter removes.
 """
 
 from __future__ import annotations

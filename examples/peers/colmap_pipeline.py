@@ -1,11 +1,11 @@
 """COLMAP: geometric verification and incremental mapping; the scale from the stick afterwards.
 
-The rig stands still, so that a camera is one image whose features are its keypoints of all frames; a point of a frame seen by
-two cameras is a match. Intrinsics are known and held; ``COLMAP_REFINE=focal`` in the environment frees both focal lengths of
-each camera, ``COLMAP_REFINE=focal,extra`` distortion too, as COLMAP does by default. Points that only two cameras see are used:
-COLMAP ignores them unless told otherwise, and then refuses rigs of two cameras and loses the stick in rigs of three. Every
-other option is COLMAP's own; ``COLMAP_MAX_ERROR_PX`` replaces its 4 pixels, the largest error of an inlier. Timed are
-verification, mapping and scaling, without filling the database.
+The cameras do not move. So a camera is one image, whose features are its keypoints of all frames, and a point that two cameras
+see in a frame is a match. Intrinsics are held fixed. With ``COLMAP_REFINE=focal`` in the environment, both focal lengths of
+each camera are estimated, with ``COLMAP_REFINE=focal,extra`` also the distortion, as COLMAP does by default. Points that only
+two cameras see are used. By default COLMAP ignores them; it then rejects rigs of two cameras, and loses the stick in rigs of
+three. All other options are COLMAP's defaults; ``COLMAP_MAX_ERROR_PX`` replaces its 4 pixels, the largest error of an inlier.
+The time includes verification, mapping and scaling, but not filling the database.
 """
 
 from __future__ import annotations
@@ -99,7 +99,7 @@ def _mapping_options() -> pycolmap.IncrementalPipelineOptions:
 
 
 def _points(session: Session, model: pycolmap.Reconstruction, columns: list[NDArray[np.int64]]) -> NDArray[np.float64]:
-    """(F, P, 3), NaN where the model has no point; of several for one the longest track."""
+    """(F, P, 3), NaN where the model has no point. If it has several for one point, the longest track is used."""
     frames, points = session.keypoints.shape[1:3]
     found, length = np.full((frames * points, 3), np.nan), np.zeros(frames * points, dtype=int)
     for point in model.points3D.values():

@@ -1,13 +1,15 @@
-"""Calibrate sessions here and set the result beside that of the peers: one table.
+"""Calibrate sessions with torchstickcal and compare the result with other programs: one table.
 
-Every peer has written a file of JSON lines from the same sessions with its own script; see the README beside this file.
+Each of the other programs has written a file of JSON lines from the same sessions with its own script; see README.md in this
+folder.
 
     python examples/peers/compare.py sessions --peer COLMAP=colmap.jsonl --peer GTSAM=gtsam.jsonl
 
-A calibration succeeds if its mean camera error, of centres after a rigid alignment without scale, is within three times the
-bound: what an estimate could expect that knew which keypoints are gross errors, the noise of all others, the lenses, and the
-stick to a millimetre. A session that a peer gave up, refused or did not finish in time counts as a failure; medians are over
-the sessions calibrated, of wall times over all that ended. Remarks are sessions calibrated, with something to say about it.
+A calibration is successful if its mean camera error is at most three times the bound. The camera error is that of the camera
+centres after a rigid alignment without scale. The bound is the error that can be expected if outliers, noise of the keypoints
+and lenses are known, and the stick to a millimetre. A session that a program gave up, refused or did not finish in time counts
+as a failure. Medians are over the sessions that were calibrated; those of wall times are over all that ended. Remarks are
+calibrated sessions for which the program printed a warning.
 """
 
 from __future__ import annotations
@@ -43,7 +45,7 @@ DRAWS = 200
 
 
 class Score(NamedTuple):
-    """One calibration of one session; errors None where there is none."""
+    """One calibration of one session; the errors are None if it failed."""
 
     name: str
     rotation_deg: float | None
@@ -52,15 +54,15 @@ class Score(NamedTuple):
     status: str
 
     def succeeded(self, bound_m: float) -> bool:
-        """Whether the cameras are as good as can be expected."""
+        """Whether the camera error is at most three times the bound."""
         return self.translation_m is not None and self.translation_m <= SUCCESS * bound_m
 
 
 def main() -> None:
     """Print the table, and write the scores."""
     parser = arguments(__doc__)
-    parser.add_argument("--peer", action="append", default=[], metavar="NAME=FILE", help="a peer's JSON lines")
-    parser.add_argument("--refine", metavar="A,B|auto|none", help="what torchstickcal is to find of the lenses (as configured)")
+    parser.add_argument("--peer", action="append", default=[], metavar="NAME=FILE", help="a program and its JSON lines")
+    parser.add_argument("--refine", metavar="A,B|auto|none", help="as of `torchstickcal calibrate` (default: none)")
     parser.add_argument("--out", type=Path, help="JSON lines of all scores")
     options = parser.parse_args()
     files = session_files(options.sessions)
@@ -88,7 +90,7 @@ def refinements(option: str | None) -> Any:
 
 
 def calibrate(session: Session, refine: Any = None) -> Found:
-    """The calibration that the peers are compared with, in its default configuration but for what it refines."""
+    """Calibrate with torchstickcal in its default configuration, except for what it refines."""
     observations = Observations(
         session.keypoints,
         session.matrices,
@@ -106,7 +108,7 @@ def calibrate(session: Session, refine: Any = None) -> Found:
 
 
 def score(line: dict[str, Any], session: SimulatedSession) -> Score:
-    """A peer's line against the truth."""
+    """The errors of a line of results."""
     if "rotations" not in line:
         return Score(line["name"], None, None, line["seconds"], line["status"])
     poses = (torch.tensor(line[part], dtype=torch.float64) for part in ("rotations", "translations"))
@@ -115,12 +117,12 @@ def score(line: dict[str, Any], session: SimulatedSession) -> Score:
 
 
 def bound(session: SimulatedSession) -> float:
-    """The mean camera error, metres, that the Cramer-Rao bound allows to expect.
+    """The mean camera error, metres, that can be expected according to the Cramér-Rao bound.
 
-    Errors are drawn from the inverse of the reduced camera system at the truth and go through the alignment of the measure.
+    Errors are drawn from the inverse of the reduced camera system at the truth, and aligned like those of an estimate.
 
     Raises:
-        FileFormatError: if the session does not carry its true points.
+        FileFormatError: if the file of the session does not contain the true points.
     """
     truth = session.truth
     if truth.points is None:
@@ -145,11 +147,11 @@ def _errors_at(truth: State, tangents: torch.Tensor) -> PoseErrors:
 
 
 def table(scores: dict[str, list[Score]], bounds: dict[str, float]) -> list[str]:
-    """Lines of Markdown, a row for each peer."""
+    """Lines of Markdown, one row for each program."""
     own = statistics.median(s.seconds for s in scores[HERE])
     bound_mm = 1000 * statistics.median(bounds.values())
     rows = [
-        f"| {len(bounds)} sessions, bound {bound_mm:.1f} mm | calibrated | success | rotation | centres | worst "
+        f"| {len(bounds)} sessions, bound {bound_mm:.1f} mm | calibrated | success | rotation | centres | largest error "
         "| error / bound | wall time | ratio | time-outs | remarks |",
         "|---|---|---|---|---|---|---|---|---|---|---|",
     ]

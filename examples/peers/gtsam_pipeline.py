@@ -1,9 +1,9 @@
-"""GTSAM: robust Levenberg-Marquardt over projections and the stick's length, from pairs that OpenCV relates.
+"""GTSAM: robust Levenberg-Marquardt on projections and the stick's length, initialised with OpenCV.
 
-GTSAM has no start of its own for a scene like this, so that the script makes one: essential matrices by RANSAC and
-``recoverPose`` for all pairs, a tree of the pairs with most inliers, scales along it by points triangulated twice, then the
-points by linear triangulation over all views. The keypoints are taken to have a standard deviation of 2.5 pixels, the stick
-one of 1 mm; both go through a Cauchy kernel with GTSAM's constant. Timed are start and optimisation, without building the
+GTSAM has no initialisation for such a scene, so this script has one: essential matrices by RANSAC and ``recoverPose`` for all
+pairs of cameras, a tree of the pairs with most inliers, relative scales from points that two pairs have in common, then linear
+triangulation of the points from all views. The keypoints are assumed to have a standard deviation of 2.5 pixels, the stick of 1
+mm; both have a Cauchy kernel with GTSAM's constant. The time includes initialisation and optimisation, but not building the
 graph.
 """
 

@@ -1,13 +1,13 @@
-"""Adjust cameras and points with PyPose's Levenberg-Marquardt, side by side with this project's solver: time and memory.
+"""Bundle adjustment with PyPose's Levenberg-Marquardt compared with this project's solver: time and memory.
 
-In an environment of its own: ``pip install pypose``, then
+In the environment of torchstickcal, with ``pip install pypose`` in addition:
 
     python examples/peers/pypose_adjustment.py --cameras 6 --frames 5 10 20
 
-Both get the problem of ``examples/benchmark_adjustment.py``, from the same start, and stop when an iteration lowers the cost by
-less than 1e-6 of it. PyPose runs as its documentation shows it: poses as SE(3) parameters, the Jacobian by autograd, dense
-Cholesky, trust region. (Its sparse path needs a CUDA backend.) Times are medians over the runs, of the adjustment alone; memory
-is the most that the process holds at a time, beyond what it holds before.
+Both get the problem of ``examples/benchmark_adjustment.py``, start from the same values, and stop when an iteration decreases
+the cost by less than 1e-6 of it. PyPose is used as in its documentation: poses as SE(3) parameters, the Jacobian by autograd,
+dense Cholesky, trust region. (Its sparse solver needs CUDA.) Times are medians over the runs, of the adjustment alone. Memory
+is the peak of the process, minus what it uses before the adjustment.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ MAX_ITERATIONS = 50
 
 
 class Reprojection(nn.Module):
-    """Pixels (C, N, 2) of points seen by cameras, the first of which stays where it is."""
+    """Pixels (C, N, 2) of points seen by cameras. The first camera is held fixed."""
 
     def __init__(self, problem: Problem) -> None:
         super().__init__()
@@ -87,8 +87,8 @@ def main() -> None:
             timings = [adjust(problem) for _ in range(options.runs)]
             seconds = statistics.median(timing.seconds for timing in timings)
             memory = memory_needed(lambda adjust=adjust, problem=problem: adjust(problem)).resident_bytes
-            held = "?" if memory is None else f"{memory / 1e6:.1f} MB"
-            row = f"| {options.cameras} | {frames} | {keypoints} | {name} | {seconds:.4f} s | {held}"
+            peak = "?" if memory is None else f"{memory / 1e6:.1f} MB"
+            row = f"| {options.cameras} | {frames} | {keypoints} | {name} | {seconds:.4f} s | {peak}"
             print(f"{row} | {timings[0].cost / keypoints:.7f} |", flush=True)
 
 

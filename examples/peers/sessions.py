@@ -1,8 +1,8 @@
-"""What the scripts of all peers share: sessions in, one JSON line of camera poses per session out.
+"""What the scripts of all programs share: reading sessions, and writing one JSON line of camera poses per session.
 
-Plain NumPy, so that it runs in the environment of any peer. A session is calibrated in a process of its own that lives
-on to the next one, so that a session which takes too long can be ended; the first session of a process pays for what the
-peer loads when first used.
+Only NumPy is needed, so it runs in the environment of any program. Sessions are calibrated in a separate process, one after
+another, so that a session that takes too long can be stopped. The time of the first session of a process includes what the
+program loads at its first use.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Session:
-    """What a peer is told; of C cameras, F frames, P points."""
+    """What a program is given: C cameras, F frames, P points."""
 
     name: str
     keypoints: Array
@@ -51,14 +51,14 @@ class Session:
 
 
 class Found(NamedTuple):
-    """What a peer hands back: poses world to camera, metres, the seconds its calibration took, and what it says of it."""
+    """The result of a program: poses world to camera in metres, the time of its calibration, and its warnings."""
 
     rotations: Array
     """(C, 3, 3)"""
     translations: Array
     """(C, 3)"""
     seconds: float
-    """wall time from keypoints in the peer's own form to poses in metres"""
+    """wall time from keypoints in the program's own data structures to poses in metres"""
     status: str = "done"
 
 
@@ -66,7 +66,7 @@ Calibrate = Callable[[Session], Found]
 
 
 class NotCalibratedError(Exception):
-    """A peer that says it cannot calibrate a session, or not all of its cameras."""
+    """A program cannot calibrate a session, or not all of its cameras."""
 
 
 def read(path: Path) -> Session:
@@ -90,7 +90,7 @@ def read(path: Path) -> Session:
 
 
 def stick_scale(session: Session, points: Array) -> float:
-    """Known over median reconstructed length of the stick, of points (F, P, 3), NaN where not known.
+    """Known divided by median reconstructed length of the stick, from points (F, P, 3), NaN where not known.
 
     Raises:
         NotCalibratedError: if no frame has both ends.
@@ -103,14 +103,14 @@ def stick_scale(session: Session, points: Array) -> float:
 
 
 def session_files(paths: list[Path]) -> list[Path]:
-    """The sessions among files and in folders, by name."""
+    """The files of sessions, and those in folders, sorted by name."""
     return [file for path in paths for file in (sorted(path.glob("*.npz")) if path.is_dir() else [path])]
 
 
 def main(calibrate: Calibrate, describe: str | None) -> None:
-    """The command line of a peer: sessions to ``--out``, one JSON line each, shown as they come."""
+    """The command line of a script: write one JSON line for each session to ``--out``, and print its status."""
     parser = arguments(describe)
-    parser.add_argument("--out", type=Path, required=True, help="JSON lines, appended to")
+    parser.add_argument("--out", type=Path, required=True, help="file of JSON lines; results are appended")
     options = parser.parse_args()
     with options.out.open("a", encoding="utf-8") as out:
         for line in measured(calibrate, session_files(options.sessions), options.timeout, options.repeats):
@@ -120,16 +120,16 @@ def main(calibrate: Calibrate, describe: str | None) -> None:
 
 
 def arguments(describe: str | None) -> argparse.ArgumentParser:
-    """What every script takes."""
+    """The arguments of every script."""
     parser = argparse.ArgumentParser(description=describe, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("sessions", type=Path, nargs="+", help="files, or folders of them")
-    parser.add_argument("--timeout", type=float, default=120.0, help="seconds after which a session is given up (120)")
-    parser.add_argument("--repeats", type=int, default=1, help="times that every session is calibrated (1)")
+    parser.add_argument("sessions", type=Path, nargs="+", help="files or folders of sessions")
+    parser.add_argument("--timeout", type=float, default=120.0, help="time limit for a session, seconds (default: 120)")
+    parser.add_argument("--repeats", type=int, default=1, help="number of calibrations of each session (default: 1)")
     return parser
 
 
 def measured(calibrate: Calibrate, files: list[Path], timeout: float, repeats: int) -> Iterator[dict[str, Any]]:
-    """Calibrate sessions one after another; for each its name, seconds, status, and the poses if there are any."""
+    """Calibrate sessions one after another. Yields the name, time and status of each, and the poses if there are any."""
     worker: _Worker | None = None
     for file in [file for file in files for _ in range(repeats)]:
         worker = worker or _Worker(calibrate)
@@ -153,7 +153,7 @@ class _Worker:
         self._process.start()
 
     def ask(self, file: Path, timeout: float) -> dict[str, Any] | None:
-        """The answer; None, and the process ended, if it takes too long."""
+        """The result of a session. If it takes too long, stop the process and return None."""
         self._connection.send(file)
         if self._connection.poll(timeout):
             try:
@@ -165,7 +165,7 @@ class _Worker:
         return None
 
     def end(self) -> None:
-        """End the process."""
+        """Stop the process."""
         self._process.kill()
         self._process.join()
 
