@@ -1,17 +1,31 @@
-"""Examples in docstrings run, and every public name has one."""
+"""Documents and docstrings are true: examples run, every public name has one, commands parse, links lead somewhere."""
 
 from __future__ import annotations
 
+import ast
+import dataclasses
 import doctest
 import importlib
+import re
+import shlex
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 import torchstickcal
+from torchstickcal.cli.arguments import parser
+from torchstickcal.layer.result import LayerResult
+from torchstickcal.result import Calibration, CameraParameter
+from torchstickcal.simulate import Noise, golf_session
 
 PROTOCOLS_AND_ERRORS = {"Callback", "GradientMode", "ConfigError", "FileFormatError", "ObservationError", "RigError"}
 PACKAGE = Path(torchstickcal.__file__).parent
+ROOT = Path(__file__).parents[1]
+PAGES = sorted(page for pattern in ("*.md", "docs/**/*.md", "examples/**/*.md") for page in ROOT.glob(pattern))
+RUNNABLE = [page for page in PAGES if page.parent == ROOT / "docs" and "```python" in page.read_text("utf-8")]
+RESULTS: dict[str, type] = {"calibration": Calibration, "result": LayerResult, "focal": CameraParameter}
+"""What the variables in the blocks of Python are."""
 
 
 def modules() -> list[str]:
@@ -31,3 +45,79 @@ def test_examples_of_a_module_run(module: str):
 @pytest.mark.parametrize("name", sorted(set(torchstickcal.__all__) - PROTOCOLS_AND_ERRORS))
 def test_every_public_name_has_an_example(name: str):
     assert ">>> " in (getattr(torchstickcal, name).__doc__ or "")
+
+
+def of(page: Path) -> str:
+    return str(page.relative_to(ROOT))
+
+
+def python_blocks(page: Path) -> list[str]:
+    return re.findall(r"```python\n(.*?)```", page.read_text("utf-8"), flags=re.DOTALL)
+
+
+def commands(page: Path, program: str) -> list[str]:
+    """Command lines of a program in blocks of code, with their continuation lines."""
+    found = re.findall(rf"^( {{4,}}){program} (.*(?:\n\1 +.*)*)", page.read_text("utf-8"), flags=re.MULTILINE)
+    return [" ".join(command.replace("\\\n", " ").split()) for _, command in found]
+
+
+def inline_commands(page: Path) -> list[str]:
+    """Command lines of torchstickcal within a text, if they are more than the name of a command."""
+    found = [" ".join(command.split()) for command in re.findall(r"`torchstickcal\s([^`]+)`", page.read_text("utf-8"))]
+    return [command for command in found if " " in command]
+
+
+@pytest.mark.parametrize("page", PAGES, ids=of)
+def test_python_of_a_page_names_what_exists(page: Path):
+    for block in python_blocks(page):
+        for node in ast.walk(ast.parse(block)):
+            if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("torchstickcal"):
+                module = importlib.import_module(str(node.module))
+                assert [alias.name for alias in node.names if not hasattr(module, alias.name)] == []
+            if isinstance(node, ast.Attribute) and isinstance(node.value, ast.Name) and node.value.id in RESULTS:
+                kind = RESULTS[node.value.id]
+                assert node.attr in {field.name for field in dataclasses.fields(kind)} | set(dir(kind))
+
+
+@pytest.mark.parametrize("page", RUNNABLE, ids=of)
+def test_python_of_a_page_runs(page: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.chdir(tmp_path)
+    for block in python_blocks(page):
+        observations, _ = golf_session(cameras=3, frames=40, noise=Noise(1.0))
+        names: dict[str, Any] = {"observations": observations, "stick": observations.sticks[0], "confidence": None}
+        names |= {"keypoints": observations.keypoints.clone().requires_grad_(), "intrinsics": observations.cameras}
+        exec(block, names)
+
+
+@pytest.mark.parametrize("page", PAGES, ids=of)
+def test_commands_of_a_page_parse(page: Path):
+    for command in [*commands(page, "torchstickcal"), *inline_commands(page)]:
+        first_alternatives = re.sub(r"\|[^\s\]]+", "", command)
+        with_numbers = re.sub(r"\b[MN]\b", "1", re.sub(r"[\[\]]", "", first_alternatives))
+        parser().parse_args(shlex.split(with_numbers, comments=True))
+
+
+@pytest.mark.parametrize("page", PAGES, ids=of)
+def test_commands_of_a_page_have_options_that_exist(page: Path):
+    for command in commands(page, r"\S*python"):
+        script, *words = command.split()
+        if script.startswith("examples/"):
+            sources = [ROOT / script, *(ROOT / script).parent.glob("sessions.py")]
+            text = "".join(source.read_text("utf-8") for source in sources)
+            assert [word for word in words if word.startswith("--") and f'"{word}"' not in text] == []
+
+
+@pytest.mark.parametrize("page", PAGES, ids=of)
+def test_links_of_a_page_lead_somewhere(page: Path):
+    text = re.sub(r"```.*?```|`[^`]*`", "", page.read_text("utf-8"), flags=re.DOTALL)
+    for link in re.findall(r"\]\((?!https?:)([^)\s]+)\)", text):
+        file, _, heading = link.partition("#")
+        target = page.parent / file if file else page
+        assert target.exists(), link
+        assert not heading or heading in headings(target), link
+
+
+def headings(page: Path) -> set[str]:
+    """The headings of a page, as links name them."""
+    found = re.findall(r"^#+ (.*)$", page.read_text("utf-8"), flags=re.MULTILINE)
+    return {re.sub(r"[^\w\- ]", "", heading.lower()).replace(" ", "-") for heading in found}
