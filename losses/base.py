@@ -22,6 +22,7 @@ import torch
 from torch import Tensor, nn
 from torch.autograd import forward_ad
 
+from torchstickcal.errors import ConfigError
 from torchstickcal.losses.robust import Quadratic, RobustKernel
 
 
@@ -82,6 +83,22 @@ class Loss(nn.Module):
         normal = copy.deepcopy(self)
         normal.kernel = Quadratic()
         return normal
+
+
+def checked_residuals(loss: Loss, residuals: Tensor, leading: tuple[int, ...]) -> Tensor:
+    """Residuals (..., m), where they have one row of m numbers for each of the things that they are about.
+
+    Raises:
+        ConfigError: if they have not.
+    """
+    if residuals.ndim != len(leading) + 1 or residuals.shape[:-1] != leading:
+        raise ConfigError(
+            "residuals have the wrong shape",
+            where=f"{type(loss).__name__}.residuals",
+            got=tuple(residuals.shape),
+            expected=f"{(*leading, 'm')}, m numbers each; m may be 1",
+        )
+    return residuals
 
 
 def tangent(value: Tensor) -> Tensor:

@@ -12,7 +12,7 @@ from torch.autograd import forward_ad
 from torchstickcal.geometry import projection
 from torchstickcal.geometry.cameras import Intrinsics, PixelMap
 from torchstickcal.geometry.symmetric import six_entries
-from torchstickcal.losses.base import Loss, tangent
+from torchstickcal.losses.base import Loss, checked_residuals, tangent
 
 
 class CameraUnknownsAt(Protocol):
@@ -23,7 +23,7 @@ class CameraUnknownsAt(Protocol):
         """k"""
         ...
 
-    def columns(self, u: Tensor, v: Tensor, pixel: PixelMap) -> tuple[Tensor, Tensor]:
+    def projection_derivatives(self, u: Tensor, v: Tensor, pixel: PixelMap) -> tuple[Tensor, Tensor]:
         """Derivatives of projections (x, y), each (..., C, k, N), at normalised coordinates (..., C, N)."""
         ...
 
@@ -108,7 +108,7 @@ class CameraPointLoss(Loss, ABC):
         seen = keypoints.isfinite().all(-1, keepdim=True) & points.isfinite().all(-1, keepdim=True).unsqueeze(-4)
         points_cam = projection.to_cameras(points.nan_to_num(), rotations, translations)
         points_cam = torch.where(seen, points_cam, points.new_tensor([0.0, 0.0, 1.0]))
-        found = self.residuals(points_cam.flatten(-3, -2), keypoints.nan_to_num().flatten(-3, -2), intrinsics)
+        found = self._residuals(points_cam.flatten(-3, -2), keypoints.nan_to_num().flatten(-3, -2), intrinsics)
         found = found.unflatten(-2, keypoints.shape[-3:-1])
         return torch.where(seen, found, torch.zeros_like(found))
 
@@ -189,7 +189,11 @@ class CameraPointLoss(Loss, ABC):
 
     def _squared(self, points_cam: Tensor, pixels: Tensor, cameras: Intrinsics) -> Tensor:
         """Squared residuals (..., C, N), not divided by sigma."""
-        return self.residuals(points_cam.mT, pixels.mT, cameras).square().sum(-1)
+        return self._residuals(points_cam.mT, pixels.mT, cameras).square().sum(-1)
+
+    def _residuals(self, points_cam: Tensor, keypoints: Tensor, cameras: Intrinsics) -> Tensor:
+        """:meth:`residuals`, checked."""
+        return checked_residuals(self, self.residuals(points_cam, keypoints, cameras), points_cam.shape[:-1])
 
     @torch.enable_grad()
     def _with_jacobian(self, points_cam: Tensor, pixels: Tensor, cameras: Intrinsics) -> tuple[Tensor, Tensor]:

@@ -9,7 +9,8 @@ import torch
 from torch import Tensor
 from torch.autograd import forward_ad
 
-from torchstickcal.losses.base import Loss, tangent
+from torchstickcal.errors import ConfigError
+from torchstickcal.losses.base import Loss, checked_residuals, tangent
 
 
 class FrameTerms(NamedTuple):
@@ -28,7 +29,7 @@ class FrameLoss(Loss, ABC):
 
     @abstractmethod
     def groups(self, sticks: Tensor) -> Tensor:
-        """The points that take part: (G, k), k different points for each of G groups.
+        """The points that take part: (G, k) of dtype long, k different points for each of G groups.
 
         Args:
             sticks: (S, 2), the ends of the session's sticks.
@@ -40,8 +41,20 @@ class FrameLoss(Loss, ABC):
 
         Args:
             points: the groups' points, (..., G, k, 3), metres.
-            lengths_m: given lengths of the session's sticks, (..., S).
+            lengths_m: given lengths of the session's S sticks, (..., S), whatever the groups are.
         """
+
+    def forward(self, points: Tensor, sticks: Tensor | None = None, lengths_m: Tensor | None = None) -> Tensor:
+        """The loss, a scalar, for a training loop.
+
+        Args:
+            points: (..., F, P, 3), metres, NaN for points that are not known.
+            sticks: (S, 2), the ends of sticks; None for none.
+            lengths_m: (..., S), their lengths, metres.
+        """
+        if sticks is None or lengths_m is None:
+            sticks, lengths_m = torch.zeros(0, 2, dtype=torch.long, device=points.device), points.new_zeros(0)
+        return self.of_session(points, sticks, lengths_m.unsqueeze(-2))
 
     def of_session(self, points: Tensor, sticks: Tensor, lengths_m: Tensor) -> Tensor:
         """The loss, a scalar, of a session's points (..., F, P, 3), NaN for points that are not known.
@@ -51,7 +64,7 @@ class FrameLoss(Loss, ABC):
             sticks: (S, 2), the ends of its sticks.
             lengths_m: their given lengths, (..., 1, S).
         """
-        grouped = points[..., self.groups(sticks), :]
+        grouped = points[..., self.checked_groups(sticks, points.shape[-2]), :]
         known = grouped.isfinite().all(-1).all(-1)
         squared = self._squared(grouped, known, lengths_m)
         return self.total(squared * self.information(squared))
@@ -70,7 +83,7 @@ class FrameLoss(Loss, ABC):
         known = active[..., groups].all(-1)
         with torch.enable_grad():
             at = _in_general_position(points[..., groups].movedim(-4, -1), known).detach().requires_grad_()
-            residuals = self.residuals(at, lengths_m.detach())
+            residuals = checked_residuals(self, self.residuals(at, lengths_m.detach()), at.shape[:-2])
             rows = [torch.autograd.grad(row.sum(), at, retain_graph=True)[0] for row in residuals.unbind(-1)]
         whitened = torch.where(known, residuals.detach().square().sum(-1), 0.0)
         whitened = whitened * self.information(whitened)
@@ -92,6 +105,22 @@ class FrameLoss(Loss, ABC):
             squared = self._squared(forward_ad.make_dual(at, along), known, lengths_m)
             return tangent(self.total(squared * self.information(squared))) / 2
 
+    def checked_groups(self, sticks: Tensor, points: int) -> Tensor:
+        """:meth:`groups` of a session with so many points.
+
+        Raises:
+            ConfigError: if they are not groups of its points.
+        """
+        groups = self.groups(sticks)
+        if not isinstance(groups, Tensor) or groups.ndim != 2 or groups.dtype != torch.long:
+            got = f"{tuple(groups.shape)}, {groups.dtype}" if isinstance(groups, Tensor) else type(groups).__name__
+            expected = "a tensor (G, k) of dtype torch.long: k points for each of G groups"
+        elif groups.numel() and not 0 <= int(groups.min()) <= int(groups.max()) < points:
+            got, expected = f"points {int(groups.min())} to {int(groups.max())}", f"0 to {points - 1}"
+        else:
+            return groups
+        raise ConfigError("unusable groups of points", where=f"{type(self).__name__}.groups", got=got, expected=expected)
+
     @torch.enable_grad()
     def _exact_hessian(self, grouped: Tensor, known: Tensor, lengths_m: Tensor) -> Tensor:
         """Half the second derivatives of the loss, blocks (..., k, k, 3, 3, F, G)."""
@@ -105,6 +134,7 @@ class FrameLoss(Loss, ABC):
     def _squared(self, grouped: Tensor, known: Tensor, lengths_m: Tensor) -> Tensor:
         """Squared residuals (..., G) of points (..., G, k, 3), zero for groups that are not known whole."""
         residuals = self.residuals(_in_general_position(grouped, known), lengths_m)
+        residuals = checked_residuals(self, residuals, grouped.shape[:-2])
         return torch.where(known, residuals.square().sum(-1), 0.0)
 
 

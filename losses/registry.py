@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -9,6 +10,7 @@ from typing import ClassVar, TypeVar
 
 from torch import Tensor
 
+from torchstickcal.errors import ConfigError
 from torchstickcal.losses.base import Loss
 from torchstickcal.registry import Registry
 
@@ -33,8 +35,7 @@ class LossContext:
 class LossSettings(ABC):
     """The settings of a loss, as a stage's table in a configuration gives them: a frozen dataclass with a default for each.
 
-    Types that a table can hold: ``float`` (above 0), ``int`` (above 0), ``bool``, ``str``, ``Literal``, lists of these, and
-    unions with ``None``.
+    :mod:`torchstickcal.settings` lists the types that a setting can have.
     """
 
     loss: ClassVar[type[Loss]]
@@ -60,10 +61,23 @@ def register_loss(name: str, *, replace: bool = False) -> Callable[[type[_Settin
         replace: whether the name may already be taken, as when a notebook's cell runs again.
 
     Raises:
-        ConfigError: if the name is taken.
+        ConfigError: if the name is taken, or if what is decorated are not the settings of a loss.
     """
+    if not isinstance(name, str):
+        raise ConfigError(
+            "a loss needs a name", where="register_loss", got=repr(name), expected='@register_loss("name"), above the settings'
+        )
 
     def register(settings: type[_Settings]) -> type[_Settings]:
+        is_settings = isinstance(settings, type) and issubclass(settings, LossSettings) and dataclasses.is_dataclass(settings)
+        if not is_settings or not issubclass(getattr(settings, "loss", object), Loss):
+            raise ConfigError(
+                "not the settings of a loss",
+                where=f"register_loss {name!r}",
+                got=getattr(settings, "__name__", repr(settings)),
+                expected="a subclass of LossSettings that is a dataclass, with the class of its loss as `loss`",
+                remedy="The order is @register_loss(...), @dataclass(frozen=True), class.",
+            )
         LOSSES.register(name, settings, replace=replace)
         return settings
 

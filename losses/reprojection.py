@@ -14,6 +14,7 @@ from torchstickcal.geometry.symmetric import symmetric_product
 from torchstickcal.losses.camera_point import CameraPointLoss, CameraPointTerms, CameraUnknownsAt, UnknownTerms
 from torchstickcal.losses.registry import LossContext, LossSettings, register_loss
 from torchstickcal.losses.robust import robust_kernel
+from torchstickcal.settings import Positive
 
 
 def reprojection_residuals(
@@ -121,7 +122,7 @@ class ReprojectionLoss(CameraPointLoss):
             hessian=hessian,
             unknown=None
             if unknowns is None
-            else _by_unknowns(unknowns.columns(u, v, m), weights, rx, ry, m, p, q, inverse_depth),
+            else _by_unknowns(unknowns.projection_derivatives(u, v, m), weights, rx, ry, m, p, q, inverse_depth),
         )
 
     def slope(
@@ -140,7 +141,7 @@ class ReprojectionLoss(CameraPointLoss):
         m = cameras.pixels_with_jacobian(u, v)
         moved_x, moved_y = m.moved(u, v, inverse_depth, moved_cam)
         if unknowns is not None and step is not None:
-            by_x, by_y = unknowns.columns(u, v, m)
+            by_x, by_y = unknowns.projection_derivatives(u, v, m)
             moved_x, moved_y = (moved + (step[..., None] * by).sum(-2) for moved, by in ((moved_x, by_x), (moved_y, by_y)))
         rx, ry = m.x - pixels[..., 0, :], m.y - pixels[..., 1, :]
         weights = self.weight * information * self.kernel.weight((rx.square() + ry.square()) * information)
@@ -159,10 +160,10 @@ class ReprojectionSettings(LossSettings):
         weight: factor on the loss.
     """
 
-    sigma_px: float | Literal["estimated"] = "estimated"
+    sigma_px: Positive | Literal["estimated"] = "estimated"
     kernel: Literal["none", "cauchy", "huber", "geman_mcclure"] = "none"
-    kernel_scale: float | None = None
-    weight: float = 1.0
+    kernel_scale: Positive | None = None
+    weight: Positive = 1.0
 
     loss = ReprojectionLoss
 

@@ -10,6 +10,7 @@ from torch import Tensor
 
 from torchstickcal.losses.registry import LossContext, LossSettings, register_loss
 from torchstickcal.losses.track import TrackLoss, combined
+from torchstickcal.settings import Positive
 
 
 def second_differences(points: Tensor) -> Tensor:
@@ -52,8 +53,8 @@ class SmoothnessSettings(LossSettings):
         weight: factor on the loss.
     """
 
-    sigma_m: float | Literal["estimated"] = "estimated"
-    weight: float = 1.0
+    sigma_m: Positive | Literal["estimated"] = "estimated"
+    weight: Positive = 1.0
 
     loss = SmoothnessLoss
 

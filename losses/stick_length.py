@@ -11,6 +11,7 @@ from torch import Tensor
 from torchstickcal.geometry.symmetric import DIAGONAL, expand, outer
 from torchstickcal.losses.frame import FrameLoss, FrameTerms
 from torchstickcal.losses.registry import LossContext, LossSettings, register_loss
+from torchstickcal.settings import Positive
 
 _MIN_LENGTH_M = 1e-6
 
@@ -42,7 +43,7 @@ class StickLengthLoss(FrameLoss):
         tensor(4.)
     """
 
-    def forward(self, starts: Tensor, ends: Tensor, length_m: float | Tensor) -> Tensor:
+    def forward(self, starts: Tensor, ends: Tensor, length_m: float | Tensor) -> Tensor:  # pyright: ignore[reportIncompatibleMethodOverride]
         """The loss, a scalar, of stick ends (..., F, S, 3) or (F, 3), metres; frames in which an end is NaN do not count.
 
         Args:
@@ -107,8 +108,8 @@ class StickLengthSettings(LossSettings):
         weight: factor on the loss.
     """
 
-    sigma_m: float | Literal["stick"] = "stick"
-    weight: float = 1.0
+    sigma_m: Positive | Literal["stick"] = "stick"
+    weight: Positive = 1.0
 
     loss = StickLengthLoss
 

@@ -26,17 +26,18 @@ class TrackTerms(NamedTuple):
 class TrackLoss(Loss, ABC):
     """Couples two or three consecutive frames of one point: its residuals are ``sum_i stencil[i] X[f + i]``, metres.
 
-    A subclass needs no more than its :attr:`stencil`. Exact gradients through a solution need least squares: no kernel.
+    A subclass needs no more than its :attr:`stencil`. To leave out a point, give it an infinite sigma. Exact gradients through
+    a solution need least squares: no kernel.
     """
 
-    stencil: ClassVar[tuple[float, ...]]
+    stencil: ClassVar[tuple[float, ...]] = ()
     """two or three factors"""
 
     def __init_subclass__(cls) -> None:
         super().__init_subclass__()
         if len(cls.stencil) not in {2, 3}:
             raise ConfigError(
-                "a track loss couples too many frames",
+                "a track loss cannot couple so many frames",
                 where=f"{cls.__name__}.stencil",
                 got=cls.stencil,
                 expected="2 or 3 factors",

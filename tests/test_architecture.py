@@ -14,6 +14,7 @@ ROOT = Path(__file__).parents[1]
 FLOORS = [
     ["errors", "files", "workers"],
     ["registry"],
+    ["settings"],
     ["geometry"],
     ["losses"],
     ["stick"],
@@ -30,7 +31,7 @@ FLOORS = [
     ["pipeline.focal_search"],
     ["pipeline.adjust"],
     ["pipeline.check", "pipeline.warnings"],
-    ["pipeline.attach", "pipeline.conclude", "pipeline.session"],
+    ["pipeline.attach", "pipeline.conclude", "pipeline.selection"],
     ["pipeline"],
     ["layer"],
     ["show"],

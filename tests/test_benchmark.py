@@ -157,7 +157,7 @@ def test_cases_of_a_folder_and_of_a_preset(folder: Path):
     hard = sources("hard", 1)[0].load()
     assert hard is not None
     assert (hard.noise_px, hard.regime) == (None, "hard")
-    with pytest.raises(CalibrationError, match="no such folder or preset"):
+    with pytest.raises(CalibrationError, match="no such folder, preset or sport"):
         sources("nowhere")
 
 
@@ -373,7 +373,7 @@ def test_a_preset_is_scored(capsys: pytest.CaptureFixture[str]):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["benchmark", "nowhere"], "a preset: sports-stick-syn"),
+        (["benchmark", "nowhere"], "one of sports-stick-syn"),
         (["benchmark", "hard", "--out", "out", "--methods", "magic"], "unknown method"),
         (["benchmark", "hard", "--out", "out", "--jobs", "0"], "no process"),
     ],

@@ -52,21 +52,21 @@ def toy(own_parts, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_the_methods_and_their_order():
-    assert list(METHODS) == [
+    shipped = [
         "default", "lbfgs", "paper", "without_length", "without_smoothness", "stick_only",
         "human_height", "human_guessed_low", "human_guessed_high", "human_only", "human_bones",
         "aruco_cube", "calib_person", "extra_calib", "kineo", "ewand",
         "human_height_in_motion", "calib_person_in_motion", "extra_calib_in_motion", "kineo_in_motion",
         "default_5_frames", "default_10_frames", "default_20_frames",
     ]  # fmt: skip
-    assert len(METHODS) == 23
+    assert [name for name in METHODS if name in shipped] == shipped
     assert set(LISTINGS) == set(config_names())
     assert {name for name, method in METHODS.items() if method.profiled} == {"default", "paper"}
 
 
 def test_the_rows_of_the_papers_tables_and_their_order():
     rows = [dataclasses.replace(ROW, method=name) for name in METHODS]
-    assert [line[0] for line in state_of_the_art(rows).rows[:11]] == [
+    shipped = [
         "ArUco cube",
         "CalibPerson",
         "CalibPerson, true mean height in motion",
@@ -79,7 +79,8 @@ def test_the_rows_of_the_papers_tables_and_their_order():
         "torchstickcal, `lbfgs`",
         "torchstickcal, `default`",
     ]
-    assert [line[0] for line in inputs(rows).rows] == [
+    assert [line[0] for line in state_of_the_art(rows).rows if line[0] in shipped] == shipped
+    shipped = [
         "Human, true stature",
         "Human, true mean height in motion",
         "Human, stature - 0.1 m and + 0.1 m",
@@ -89,12 +90,13 @@ def test_the_rows_of_the_papers_tables_and_their_order():
         "torchstickcal, `paper` (the published method)",
         "torchstickcal, `default`",
     ]
+    assert [line[0] for line in inputs(rows).rows if line[0] in shipped] == shipped
 
 
 def test_a_baseline_of_one_s_own_is_a_method(toy: None):
     assert METHODS["toy"].title == "Toy"
     assert METHODS["toy_in_motion"].height_in_motion
-    assert list(METHODS).index("toy") == list(METHODS).index("ewand") + 1
+    assert list(METHODS).index("toy") > list(METHODS).index("ewand")
     assert method("toy").estimate is BASELINES["toy"]
 
 
@@ -131,7 +133,7 @@ def test_what_cannot_be_registered(own_parts):
         Listing("Wrong", {"state_of_the_art": None})  # type: ignore[dict-item]
     with pytest.raises(ConfigError, match=r"unknown input .*'heigth_m'.*height_m"):
         baseline("wrong", Listing("Wrong"), needs=("heigth_m",))(estimate)
-    with pytest.raises(ConfigError, match=r"baseline of that name already.*'kineo'"):
+    with pytest.raises(ConfigError, match=r"the name is taken .*baseline.*'kineo'"):
         baseline("kineo", Listing("Kineo, again"))(estimate)
     baseline("kineo", Listing("Kineo, again"), replace=True)(estimate)
     assert METHODS["kineo"].title == "Kineo, again"

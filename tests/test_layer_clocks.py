@@ -113,7 +113,7 @@ def test_a_warm_start_leads_to_the_same_place_from_the_clocks_found():
 @pytest.mark.parametrize("refine", [("time_offset",), ("time_offset", "readout", "focal_shared")])
 def test_gradients_are_those_of_the_solve_with_the_motion_as_it_is(monkeypatch: pytest.MonkeyPatch, refine: tuple[str, ...]):
     session = ROLLING.generate()
-    layer, moved = layer_of(session, *refine), Exposures.on_common_frames
+    layer, moved = layer_of(session, *refine), Exposures.at_common_times
     last: list[Callable[[Measurements], Measurements]] = []
 
     def recorded(self: Exposures, seen: Measurements, *at: Any) -> Measurements:
@@ -122,10 +122,10 @@ def test_gradients_are_those_of_the_solve_with_the_motion_as_it_is(monkeypatch: 
         last.append(lambda m: replace(m, pixels=m.pixels + shift, confidence=m.confidence * weight, motion=found.motion))
         return found
 
-    monkeypatch.setattr(Exposures, "on_common_frames", recorded)
+    monkeypatch.setattr(Exposures, "at_common_times", recorded)
     keypoints = session.observations.keypoints.clone().requires_grad_()
     result = run(layer, session, keypoints)
-    monkeypatch.setattr(Exposures, "on_common_frames", lambda _, seen, *at: last[-1](seen))
+    monkeypatch.setattr(Exposures, "at_common_times", lambda _, seen, *at: last[-1](seen))
     generator = torch.Generator().manual_seed(0)
     direction = torch.randn(keypoints.shape, generator=generator, dtype=torch.float64)
     step = 1e-3

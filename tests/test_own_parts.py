@@ -27,7 +27,7 @@ from torchstickcal.losses import (
 from torchstickcal.model.measurements import Measurements
 from torchstickcal.model.objective import Objective
 from torchstickcal.model.state import State
-from torchstickcal.model.unknowns import LensUnknown, Sharing, View, all_unknowns, register_unknown
+from torchstickcal.model.unknowns import REFINEMENTS, LensUnknown, Sharing, View, all_unknowns, register_unknown
 from torchstickcal.show.report import summary, table
 from torchstickcal.simulate import Noise, SessionSpec, golf_session
 from torchstickcal.simulate.regimes import GaussianNoise
@@ -108,7 +108,7 @@ class Aspect(LensUnknown):
     unit = ""
     components = ("aspect",)
     variants: ClassVar = {"aspect": Sharing.OWN, "aspect_shared": Sharing.GROUP}
-    noticeable = 0.1
+    noticeable_prior_share = 0.1
 
     def prior(self, cameras: Intrinsics) -> Tensor:
         return torch.full_like(cameras.focal_px, 0.05).unsqueeze(-1)
@@ -181,8 +181,43 @@ class TestLoss:
     def test_unknown_settings_and_taken_names_are_refused(self):
         with pytest.raises(ConfigError, match=r"equal_forearms.sigma.*Did you mean 'sigma_m'"):
             load_config(with_stage_losses(equal_forearms={"sigma": 1.0}))
-        with pytest.raises(ConfigError, match="there is a loss of that name already"):
+        with pytest.raises(ConfigError, match=r"the name is taken .*loss"):
             register_loss("reprojection")(EqualForearms)
+
+    @pytest.mark.parametrize("settings", [EqualLengths, type("Bare", (LossSettings,), {"loss": EqualLengths}), 3])
+    def test_what_is_no_settings_cannot_be_registered(self, settings):
+        with pytest.raises(ConfigError, match=r"not the settings of a loss.*'mine'.*@dataclass"):
+            register_loss("mine")(settings)
+
+    def test_a_decorator_without_a_name_is_refused(self):
+        with pytest.raises(ConfigError, match="a loss needs a name"):
+            register_loss(EqualForearms)  # type: ignore[arg-type]
+
+    def test_it_has_a_scalar_for_training_loops(self):
+        points = torch.zeros(2, 5, 4, 3, dtype=torch.float64)
+        points[..., 1, 0], points[..., 3, 1] = 1.0, 1.5
+        points[0, 0, 0] = torch.nan
+        points.requires_grad_()
+        loss = EqualLengths([0, 1, 2, 3], 0.1)(points)
+        assert float(loss.detach()) == pytest.approx(9 * 0.5**2 / 0.1**2)
+        loss.backward()
+        assert points.grad is not None
+        assert points.grad[1, 0, 1].tolist() == pytest.approx([-100.0, 0, 0])
+
+    @pytest.mark.parametrize(
+        ("method", "value", "message"),
+        [
+            ("groups", torch.tensor([0, 1]), r"\(2,\), torch.int64.*a tensor \(G, k\)"),
+            ("groups", [[0, 1]], "list; expected a tensor"),
+            ("groups", torch.tensor([[0, 99]]), "points 0 to 99; expected 0 to 20"),
+            ("residuals", torch.zeros(1, 8, 1, dtype=torch.float64), r"\(1, 8, 1\); expected \(1, 8, 1, 'm'\)"),
+        ],
+    )
+    def test_wrong_shapes_are_named(self, monkeypatch: pytest.MonkeyPatch, method: str, value, message: str):
+        monkeypatch.setattr(EqualLengths, method, lambda *arguments: value)
+        observations, _ = golf_session(cameras=3, frames=8)
+        with pytest.raises(ConfigError, match=rf"EqualLengths.{method}.*{message}"):
+            calibrate(observations, with_stage_losses(equal_forearms={}))
 
     @pytest.mark.parametrize("smooth", [False, True])
     def test_gradients_of_the_layer_are_exact(self, smooth: bool):
@@ -230,8 +265,19 @@ LOSS_SETS = {
 }
 
 
-@pytest.mark.parametrize("losses", LOSS_SETS.values(), ids=LOSS_SETS.keys())
+def test_exact_gradients_refuse_a_track_loss_with_a_kernel(monkeypatch: pytest.MonkeyPatch, own_parts):
+    register_loss("slow")(SlowSettings)
+    monkeypatch.setattr(SlowSettings, "build", lambda self, context: SlowLoss(0.1, kernel=Cauchy()))
+    observations, _ = golf_session(cameras=3, frames=8, noise=Noise(1.0))
+    config = with_stage_losses(slow={})
+    with pytest.raises(ConfigError, match=r"without a robust kernel.*slow.*Cauchy.*gauss_newton"):
+        CalibrationLayer(observations.sticks, config)(observations.keypoints, observations.cameras)
+    layer = CalibrationLayer(observations.sticks, config, gradient="gauss_newton")
+    assert layer(observations.keypoints, observations.cameras).status == ("converged",)
+
+
 @pytest.mark.parametrize("exact", [False, True], ids=["gauss-newton", "exact"])
+@pytest.mark.parametrize("losses", LOSS_SETS.values(), ids=LOSS_SETS.keys())
 def test_linear_systems_are_those_of_autograd(disturbed: tuple[Measurements, State], losses: dict[str, Any], exact: bool):
     """The solution of the eliminated system satisfies the dense one, whose Hessian autograd takes of the objective."""
     whole, state = disturbed
@@ -352,5 +398,61 @@ def test_derivatives_by_shipped_unknowns_are_the_automatic_ones():
         view = View(u, v, cameras.pixels_with_jacobian(u, v), cameras, None)
         for unknown in all_unknowns().values():
             if isinstance(unknown, LensUnknown):
-                for found, expected in zip(unknown.columns(view), LensUnknown.columns(unknown, view), strict=True):
+                for found, expected in zip(
+                    unknown.projection_derivatives(view), LensUnknown.projection_derivatives(unknown, view), strict=True
+                ):
                     torch.testing.assert_close(found.expand_as(expected), expected, rtol=1e-10, atol=1e-10)
+                by_values = LensUnknown.value_derivatives(unknown, cameras)
+                torch.testing.assert_close(unknown.value_derivatives(cameras), by_values, rtol=1e-12, atol=1e-12)
+
+
+def changed(**attributes: Any) -> type[LensUnknown]:
+    """The aspect ratio with something else."""
+    return type("Faulty", (Aspect,), {"name": "faulty", "variants": {"faulty": Sharing.OWN}} | attributes)
+
+
+def moved_skew(self, cameras: Intrinsics, deviations: Tensor) -> Intrinsics:
+    matrix = cameras.matrix.clone()
+    matrix[..., 0, 1] = matrix[..., 0, 1] + deviations[..., 0]
+    return replace(cameras, matrix=matrix)
+
+
+def in_place(self, cameras: Intrinsics, deviations: Tensor) -> Intrinsics:
+    cameras.matrix[..., 1, 1] *= deviations.exp()[..., 0]
+    return cameras
+
+
+def doubled(self, cameras: Intrinsics, deviations: Tensor) -> Intrinsics:
+    return replace(cameras, matrix=2 * cameras.matrix)
+
+
+def squared(self, cameras: Intrinsics, deviations: Tensor) -> Intrinsics:
+    return Aspect.applied(self, cameras, deviations.square())
+
+
+def first_coefficient(self, cameras: Intrinsics, deviations: Tensor) -> Intrinsics:
+    return replace(cameras, distortion=cameras.distortion.clone())
+
+
+@pytest.mark.parametrize(
+    ("attributes", "message"),
+    [
+        ({"label": None}, "attribute `label`.*a text"),
+        ({"components": "faulty"}, "attribute `components`.*a tuple"),
+        ({"variants": {"faulty": "own"}}, "attribute `variants`.*members of Sharing"),
+        ({"name": "focal"}, "another unknown has this name"),
+        ({"prior": lambda self, cameras: torch.ones_like(cameras.focal_px)}, r"prior.*\(1, 2\)"),
+        ({"applied": moved_skew}, "applied before or after 'focal'.*a fraction of it"),
+        ({"applied": in_place}, "applied.*changes the cameras that it is given"),
+        ({"applied": doubled}, "applied, no deviation.*the same cameras"),
+        ({"applied": squared}, "a deviation twice.*add up"),
+        ({"applied": lambda self, cameras, deviations: cameras}, "a deviation.*the same projections"),
+        ({"applied": first_coefficient}, r"no distortion \(cameras.distortion is None\).*AttributeError"),
+        ({"values": lambda self, cameras: cameras.focal_px}, r"values.*\(1, 2\)"),
+    ],
+)
+@pytest.mark.usefixtures("own_parts")
+def test_faulty_unknowns_are_refused_when_they_are_registered(attributes: dict[str, Any], message: str):
+    with pytest.raises(ConfigError, match=rf"unusable camera unknown.*Faulty.*{message}"):
+        register_unknown(changed(**attributes))
+    assert "faulty" not in REFINEMENTS

@@ -77,11 +77,11 @@ class Skew(LensUnknown):
     variants = {"toy_skew": Sharing.OWN}
 
     def prior(self, cameras):
-        return cameras.focal_px.unsqueeze(-1) * 0 + 1.0
+        return cameras.focal_px.unsqueeze(-1) * 0 + 1e-3
 
     def applied(self, cameras, deviations):
         matrix = cameras.matrix.clone()
-        matrix[..., 0, 1] = matrix[..., 0, 1] + deviations[..., 0]
+        matrix[..., 0, 1] = matrix[..., 0, 1] + deviations[..., 0] * matrix[..., 0, 0]
         return replace(cameras, matrix=matrix)
 
     def values(self, cameras):
@@ -217,4 +217,4 @@ def test_a_plugin_that_takes_a_name_is_refused(tmp_path: Path, capsys: pytest.Ca
     (tmp_path / "taken.py").write_text('from torchstickcal.simulate import SPORTS\nSPORTS.register("golf", SPORTS["golf"])')
     for _ in range(2):
         assert main(["list", "--plugin", str(tmp_path / "taken.py")]) == 2
-        assert "got ConfigError: there is a sport of that name already" in capsys.readouterr().err
+        assert "error: the name is taken (register: sport)" in capsys.readouterr().err

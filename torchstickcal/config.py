@@ -7,9 +7,6 @@ with ``extends = "default"`` and state only what differs. ``false`` in place of 
 from __future__ import annotations
 
 import dataclasses
-import math
-import tomllib
-import types
 import typing
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -18,12 +15,13 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 from torchstickcal.errors import ConfigError
+from torchstickcal.files import parse_toml
 from torchstickcal.losses import LOSSES, CameraPointLoss, LossSettings, ReprojectionSettings
 from torchstickcal.model.unknowns import REFINEMENTS
-from torchstickcal.registry import Registry, suggestion
+from torchstickcal.registry import suggestion
+from torchstickcal.settings import Positive, PositiveInt, build, build_dataclass, check_key
 
 _EXTENDS = "extends"
-_UNIONS = (types.UnionType, typing.Union)
 
 
 Refine = Annotated[str, REFINEMENTS]
@@ -40,9 +38,9 @@ class InitialiseSettings:
         threshold_px: distance from the epipolar line up to which a point agrees with a pair.
     """
 
-    min_common_points: int = 20
-    max_points: int = 200
-    threshold_px: float = 4.0
+    min_common_points: PositiveInt = 20
+    max_points: PositiveInt = 200
+    threshold_px: Positive = 4.0
 
 
 @dataclass(frozen=True)
@@ -57,7 +55,7 @@ class ScaleSettings:
 
     start: list[str]
     end: list[str]
-    length_m: float
+    length_m: Positive
 
 
 @dataclass(frozen=True)
@@ -79,10 +77,35 @@ class Stage:
 
     cameras: Literal["free", "held"] = "free"
     losses: dict[str, LossSettings] = field(default_factory=lambda: {"reprojection": ReprojectionSettings()})
-    reject_sigmas: float | None = None
+    reject_sigmas: Positive | None = None
     rescale: bool = False
-    max_iterations: int = 100
-    cost_tolerance: float = 1e-9
+    max_iterations: PositiveInt = 100
+    cost_tolerance: Positive = 1e-9
+
+    @staticmethod
+    def of_table(value: Any, where: str, path: tuple[str, ...]) -> Stage:
+        """A stage from its table; arguments and errors as of :func:`torchstickcal.settings.build`."""
+        if not isinstance(value, dict):
+            raise ConfigError("unusable value", where=f"{where}: {'.'.join(path)}", got=repr(value), expected="a table")
+        own = [field.name for field in dataclasses.fields(Stage) if field.name != "losses"]
+        if ambiguous := set(own) & set(LOSSES):
+            raise ConfigError(
+                "a loss has the name of a stage's setting", where="losses", got=", ".join(ambiguous), expected="another name"
+            )
+        for key in value:
+            check_key(key, [*own, *LOSSES], where, path)
+        tables = {"reprojection": {}} | {key: item for key, item in value.items() if key not in own}
+        built = {name: build(LOSSES[name] | None, table, where, (*path, name)) for name, table in tables.items()}
+        losses = {name: settings for name, settings in built.items() if settings is not None}
+        if not any(issubclass(settings.loss, CameraPointLoss) for settings in losses.values()):
+            raise ConfigError(
+                "no loss compares points with keypoints",
+                where=f"{where}: {'.'.join(path)}",
+                got=", ".join(losses) or "no loss",
+                expected="reprojection, or another loss of a camera and a point",
+            )
+        settings = build_dataclass(Stage, {key: item for key, item in value.items() if key in own}, where, path)
+        return dataclasses.replace(settings, losses=losses)
 
 
 @dataclass(frozen=True)
@@ -121,7 +144,7 @@ class Config:
     refine: list[Refine] | Literal["auto"] = field(default_factory=list)
     camera_groups: list[str] = field(default_factory=list)
     synchronise: bool = True
-    max_offset_s: float = 2.0
+    max_offset_s: Positive = 2.0
 
 
 def config_names() -> list[str]:
@@ -152,9 +175,11 @@ def load_config(config: str | Path | Mapping[str, Any] | Config = "default") -> 
     """
     if isinstance(config, Config):
         return config
+    if not isinstance(config, str | Path | Mapping):
+        expected = "the name of a configuration, a TOML file, a mapping of its keys, or a Config"
+        raise ConfigError("not a configuration", where="config", got=type(config).__name__, expected=expected)
     where = "mapping" if isinstance(config, Mapping) else str(config)
-    keys = _extended(dict(config), where) if isinstance(config, Mapping) else _read(config)
-    built: Config = _build(Config, keys, where, ())
+    built: Config = build(Config, _keys(config, Path(), ()), where, ())
     if not built.stages:
         raise ConfigError("nothing to do", where=f"{where}: stages", got="no stage", expected="at least one")
     return built
@@ -166,39 +191,72 @@ def with_refine(config: Config, refine: Any) -> Config:
     Raises:
         ConfigError: if that is not a list of :data:`Refine`, or ``auto``.
     """
-    chosen = _build(typing.get_type_hints(Config, include_extras=True)["refine"], refine, "calibrate", ("refine",))
+    chosen = build(typing.get_type_hints(Config, include_extras=True)["refine"], refine, "calibrate", ("refine",))
     return dataclasses.replace(config, refine=chosen)
 
 
-def _read(config: str | Path) -> dict[str, Any]:
-    """The keys of a named configuration or a file, with what it extends filled in."""
-    names = config_names()
-    if str(config) in names:
-        text = (resources.files("torchstickcal.configs") / f"{config}.toml").read_text("utf-8")
-    elif Path(config).is_file():
-        text = Path(config).read_text("utf-8")
+def _keys(config: str | Path | Mapping[str, Any], folder: Path, extending: tuple[str, ...]) -> dict[str, Any]:
+    """The keys of a mapping, a named configuration or a file, with what it extends filled in.
+
+    Args:
+        config: which.
+        folder: where files with relative paths are.
+        extending: what extends it, from the first on.
+    """
+    if isinstance(config, Mapping):
+        name, keys = "mapping", dict(config)
     else:
-        raise ConfigError(
-            "unknown configuration",
-            where="config",
-            got=repr(str(config)),
-            expected=f"a TOML file or one of {', '.join(names)}",
-            remedy=suggestion(str(config), names),
-        )
-    try:
-        keys = tomllib.loads(text)
-    except tomllib.TOMLDecodeError as error:
-        raise ConfigError("a configuration is not TOML", where=str(config), got=str(error), expected="TOML") from error
-    return _extended(keys, str(config))
-
-
-def _extended(keys: dict[str, Any], where: str) -> dict[str, Any]:
+        name, folder, content = _content(config, folder)
+        keys = _parsed(content, name)
+    if name in extending:
+        circle = " -> ".join((*extending, name))
+        raise ConfigError("configurations extend each other in a circle", where=_EXTENDS, got=circle, expected="an end")
     base = keys.pop(_EXTENDS, None)
     if base is None:
         return keys
     if not isinstance(base, str):
-        raise ConfigError("unusable value", where=f"{where}: {_EXTENDS}", got=repr(base), expected="a configuration's name")
-    return _merged(_read(base), keys)
+        raise ConfigError("unusable value", where=f"{name}: {_EXTENDS}", got=repr(base), expected="a configuration's name")
+    extended = _keys(base, folder, (*extending, name))
+    _check_stage_names(extended, keys, name)
+    return _merged(extended, keys)
+
+
+def _content(config: str | Path, folder: Path) -> tuple[str, Path, bytes]:
+    """The name, the folder and the content of a configuration that is given by its name or its file."""
+    names = config_names()
+    if config in names:
+        return str(config), folder, (resources.files("torchstickcal.configs") / f"{config}.toml").read_bytes()
+    path = folder / config
+    try:
+        if path.is_file():
+            return str(path), path.parent, path.read_bytes()
+    except (OSError, ValueError) as error:
+        raise ConfigError("a file cannot be read", where="config", got=str(error), expected="a TOML file") from error
+    raise ConfigError(
+        "unknown configuration",
+        where="config",
+        got=repr(str(config)),
+        expected=f"a TOML file or one of {', '.join(names)}",
+        remedy=suggestion(str(config), names),
+    )
+
+
+def _parsed(content: bytes, where: str) -> dict[str, Any]:
+    try:
+        return parse_toml(content)
+    except ValueError as error:
+        raise ConfigError("a configuration is not TOML", where=where, got=str(error), expected="TOML in UTF-8") from error
+
+
+def _check_stage_names(base: dict[str, Any], changes: dict[str, Any], where: str) -> None:
+    """Refuse a new stage with almost the name of one that is extended: it is a spelling mistake."""
+    old, new = base.get("stages"), changes.get("stages")
+    if not isinstance(old, dict) or not isinstance(new, dict):
+        return
+    for name in new:
+        if name not in old and (near := suggestion(str(name), old, cutoff=0.8)):
+            expected = f"one of {', '.join(old)}, or a clearly different name for a new stage"
+            raise ConfigError("unknown stage", where=f"{where}: stages", got=repr(name), expected=expected, remedy=near)
 
 
 def _merged(base: dict[str, Any], changes: dict[str, Any]) -> dict[str, Any]:
@@ -207,111 +265,3 @@ def _merged(base: dict[str, Any], changes: dict[str, Any]) -> dict[str, Any]:
         nested = isinstance(value, dict) and isinstance(base.get(key), dict)
         merged[key] = _merged(base[key], value) if nested else value
     return merged
-
-
-def _build(kind: Any, value: Any, where: str, path: tuple[str, ...]) -> Any:
-    """A value of a type built from TOML, or a ConfigError that names the key."""
-    if isinstance(kind, type) and isinstance(value, kind) and dataclasses.is_dataclass(kind):
-        return value
-    if kind is Stage:
-        return _build_stage(value, where, path)
-    if dataclasses.is_dataclass(kind):
-        return _build_dataclass(typing.cast(type, kind), value, where, path)
-    origin, arguments = typing.get_origin(kind), typing.get_args(kind)
-    if origin in _UNIONS:
-        if value is False and type(None) in arguments:
-            return None
-        options = [option for option in arguments if option is not type(None)]
-        matching = [option for option in options if _fits(option, value)]
-        if matching:
-            return _build(matching[0], value, where, path)
-    elif origin is dict and isinstance(value, dict):
-        return {key: _build(arguments[1], item, where, (*path, key)) for key, item in value.items()}
-    elif origin is list and isinstance(value, list | tuple):
-        return [_build(arguments[0], item, where, (*path, str(number))) for number, item in enumerate(value)]
-    elif _fits(kind, value):
-        return float(value) if kind is float else value
-    raise ConfigError(
-        "unusable value", where=f"{where}: {'.'.join(path) or 'top level'}", got=repr(value), expected=_description(kind)
-    )
-
-
-def _build_dataclass(kind: type, value: Any, where: str, path: tuple[str, ...]) -> Any:
-    if not isinstance(value, dict):
-        raise ConfigError("unusable value", where=f"{where}: {'.'.join(path)}", got=repr(value), expected="a table")
-    hints, fields = typing.get_type_hints(kind, include_extras=True), dataclasses.fields(kind)
-    for key in value:
-        _check_key(key, [field.name for field in fields], where, path)
-    required = [field.name for field in fields if field.default is field.default_factory is dataclasses.MISSING]
-    missing = [name for name in required if name not in value]
-    if missing:
-        table = ".".join(path) or "top level"
-        raise ConfigError("missing key", where=f"{where}: {table}", got=", ".join(value) or "nothing", expected=missing[0])
-    return kind(**{key: _build(hints[key], item, where, (*path, key)) for key, item in value.items()})
-
-
-def _build_stage(value: Any, where: str, path: tuple[str, ...]) -> Stage:
-    """A stage, in whose table the losses stand beside the stage's own settings."""
-    if not isinstance(value, dict):
-        raise ConfigError("unusable value", where=f"{where}: {'.'.join(path)}", got=repr(value), expected="a table")
-    own = [field.name for field in dataclasses.fields(Stage) if field.name != "losses"]
-    for key in value:
-        _check_key(key, [*own, *LOSSES], where, path)
-    tables = {"reprojection": {}} | {key: item for key, item in value.items() if key not in own}
-    built = {name: _build(LOSSES[name] | None, table, where, (*path, name)) for name, table in tables.items()}
-    losses = {name: settings for name, settings in built.items() if settings is not None}
-    if not any(issubclass(settings.loss, CameraPointLoss) for settings in losses.values()):
-        raise ConfigError(
-            "no loss compares points with keypoints",
-            where=f"{where}: {'.'.join(path)}",
-            got=", ".join(losses) or "no loss",
-            expected="reprojection, or another loss of a camera and a point",
-        )
-    settings = _build_dataclass(Stage, {key: item for key, item in value.items() if key in own}, where, path)
-    return dataclasses.replace(settings, losses=losses)
-
-
-def _check_key(key: str, known: list[str], where: str, path: tuple[str, ...]) -> None:
-    if key not in known:
-        raise ConfigError(
-            "unknown key",
-            where=f"{where}: {'.'.join((*path, key))}",
-            got=repr(key),
-            expected=f"one of {', '.join(known)}",
-            remedy=suggestion(key, known),
-        )
-
-
-def _registry(kind: Any) -> Registry[Any] | None:
-    """The registry whose names a type stands for; None for other types."""
-    return typing.get_args(kind)[1] if typing.get_origin(kind) is Annotated else None
-
-
-def _fits(kind: Any, value: Any) -> bool:
-    if (registry := _registry(kind)) is not None:
-        return isinstance(value, str) and value in registry
-    if typing.get_origin(kind) is Literal:
-        return isinstance(value, str) and value in typing.get_args(kind)
-    if typing.get_origin(kind) is list:
-        return isinstance(value, list | tuple)
-    if dataclasses.is_dataclass(kind):
-        return isinstance(value, dict | typing.cast(type, kind))
-    if kind is float:
-        return isinstance(value, int | float) and not isinstance(value, bool) and 0 < value < math.inf
-    if kind is int:
-        return isinstance(value, int) and not isinstance(value, bool) and value > 0
-    return isinstance(kind, type) and isinstance(value, kind)
-
-
-def _description(kind: Any) -> str:
-    if (registry := _registry(kind)) is not None:
-        return f"one of {', '.join(registry)}"
-    if typing.get_origin(kind) is Literal:
-        return " or ".join(repr(option) for option in typing.get_args(kind))
-    if typing.get_origin(kind) is list:
-        return f"a list of {_description(typing.get_args(kind)[0])}"
-    if typing.get_origin(kind) in _UNIONS:
-        return " or ".join("false" if option is type(None) else _description(option) for option in typing.get_args(kind))
-    if dataclasses.is_dataclass(kind):
-        return "a table"
-    return {float: "a number above 0", int: "a whole number above 0", bool: "true or false", str: "a text"}.get(kind, str(kind))

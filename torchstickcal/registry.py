@@ -57,13 +57,17 @@ class Registry(Mapping[str, _Thing]):
             self._import_shipped()
         if name in self._things and not replace:
             raise ConfigError(
-                f"there is a {self.kind} of that name already",
-                where=f"register a {self.kind}",
+                "the name is taken",
+                where=f"register: {self.kind}",
                 got=repr(name),
                 expected="another name, or replace=True",
             )
         self._things[name] = thing
         return thing
+
+    def registered(self) -> dict[str, _Thing]:
+        """What has been registered so far, whether or not the folder's modules have all been imported."""
+        return dict(self._things)
 
     def __getitem__(self, name: str) -> _Thing:
         """The thing of a name.
@@ -132,7 +136,7 @@ class Registry(Mapping[str, _Thing]):
         return self._folder in _being_imported or getattr(package, "_initializing", False)
 
 
-def suggestion(name: str, known: Iterable[str]) -> str:
-    """The known name most like a misspelt one, as a question; empty if none is."""
-    near = difflib.get_close_matches(name, list(known), n=1)
+def suggestion(name: str, known: Iterable[str], cutoff: float = 0.6) -> str:
+    """The known name most like a misspelt one, as a question; empty if none is similar, from 0 to 1, by ``cutoff``."""
+    near = difflib.get_close_matches(name, list(known), n=1, cutoff=cutoff)
     return f"Did you mean {near[0]!r}?" if near else ""

@@ -13,7 +13,17 @@ from numpy.typing import NDArray
 from torchstickcal.errors import CalibrationError, FileFormatError
 from torchstickcal.io import SESSION_READERS, Truth, find_reader
 from torchstickcal.observations import Observations
-from torchstickcal.simulate import PRESETS, SPORTS, Cube, CubeViews, SessionSpec, SimulatedSession, preset, read_simulated
+from torchstickcal.registry import suggestion
+from torchstickcal.simulate import (
+    PRESETS,
+    SPORTS,
+    Cube,
+    CubeViews,
+    SessionSpec,
+    SimulatedSession,
+    read_simulated,
+    session_specs,
+)
 from torchstickcal.simulate.rigs import CameraRig
 from torchstickcal.simulate.skeleton import STANDING_HEIGHT_M
 
@@ -100,20 +110,23 @@ class Source:
 
 
 def sources(place: str, count: int | None = None) -> tuple[Source, ...]:
-    """The cases of a folder, sorted by name, or of a preset, in its order.
+    """The cases of a folder, sorted by name, or those of a preset or a sport, in their order.
 
     Args:
-        place: a folder of sessions of any known format, or the name of a preset. Other files in the folder are ignored.
-        count: number of cases, from the first one; None for all.
+        place: a folder of sessions of any known format, or the name of a preset or a sport. Other files in the folder are
+            ignored.
+        count: number of cases, from the first one; None for all, and for one session of a sport.
 
     Raises:
-        CalibrationError: if there is no such folder or preset, or no session in the folder.
+        CalibrationError: if there is no such folder, preset or sport, no session in the folder, or for a count below 1.
 
     Example:
         >>> from torchstickcal.benchmark import sources
         >>> [source.name for source in sources("hard", 2)]
         ['hard00_golf_hemisphere_cam2', 'hard01_baseball_random_cam2']
     """
+    if count is not None and count < 1:
+        raise CalibrationError("no sessions to measure", where="count", got=count, expected="1 or more")
     folder = Path(place)
     if folder.is_dir():
         paths = sorted(filter(_is_session, folder.iterdir()))
@@ -121,11 +134,17 @@ def sources(place: str, count: int | None = None) -> tuple[Source, ...]:
             expected = f"sessions of a known format: {', '.join(SESSION_READERS)}"
             raise FileFormatError("no sessions", where=place, got="none in the folder", expected=expected)
         found = tuple(Source(path.stem, path) for path in paths)
-    elif place in PRESETS:
-        found = tuple(Source(spec.name, spec) for spec in preset(place))
+    elif place in PRESETS or place in SPORTS:
+        found = tuple(Source(spec.name, spec) for spec in session_specs(place, count))
     else:
-        expected = f"a folder of sessions, or a preset: {', '.join(PRESETS)}"
-        raise CalibrationError("no such folder or preset", where="benchmark", got=repr(place), expected=expected)
+        known = [*PRESETS, *SPORTS]
+        raise CalibrationError(
+            "no such folder, preset or sport",
+            where="benchmark",
+            got=repr(place),
+            expected=f"a folder of sessions, or one of {', '.join(known)}",
+            remedy=suggestion(place, known),
+        )
     return found[:count]
 
 

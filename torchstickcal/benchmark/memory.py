@@ -10,9 +10,11 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import torch
 from torch.profiler import ProfilerActivity, profile
 
 from torchstickcal.observations import Observations
+from torchstickcal.workers import on_worker
 
 _STATUS, _RESET = Path("/proc/self/status"), Path("/proc/self/clear_refs")
 
@@ -34,7 +36,7 @@ def memory_needed(call: Callable[[], Any]) -> Memory:
         >>> memory_needed(lambda: torch.ones(1_000_000).sum()).tensor_bytes >= 4_000_000
         True
     """
-    return Memory(_peak_resident_bytes(call), _peak_tensor_bytes(call))
+    return Memory(_peak_resident_bytes(call), on_worker(torch.device("cpu"), _peak_tensor_bytes, call))
 
 
 def input_bytes(observations: Observations) -> int:
@@ -60,7 +62,10 @@ def _peak_resident_bytes(call: Callable[[], Any]) -> int | None:
 
 
 def _peak_tensor_bytes(call: Callable[[], Any]) -> int:
-    """Peak of torch's own record of allocations; a block that is freed before anything else is allocated does not count."""
+    """Peak of torch's own record of allocations; a block that is freed before anything else is allocated does not count.
+
+    The profiler records the thread that starts it: it has to be the one in which the call computes, a worker.
+    """
     profiler = profile(activities=[ProfilerActivity.CPU], profile_memory=True)
     with _quiet():
         profiler.start()

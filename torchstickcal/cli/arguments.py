@@ -76,7 +76,9 @@ def _add_benchmark(commands: Any) -> None:
         "tables and figures.",
     )
     command.add_argument(
-        "place", metavar="DIR|PRESET", help="folder of sessions, or a preset from `torchstickcal list presets`"
+        "place",
+        metavar="DIR|PRESET|SPORT",
+        help="folder of sessions, or name from `torchstickcal list presets` or `list sports`",
     )
     command.add_argument("--count", metavar="N", type=int, help="only the first N sessions")
     command.add_argument("--json", metavar="FILE", type=Path, help="write the errors as JSON (without --out)")

@@ -54,6 +54,7 @@ def _score_line(score: SequenceScore, width: int) -> str:
 def _measure(options: argparse.Namespace) -> int:
     """The errors of all methods: a folder with measurements, tables, figures and pages."""
     from torchstickcal.benchmark import METHODS, run_benchmark, sources, write_results
+    from torchstickcal.benchmark.run import FAILED
 
     names = options.methods.split(",") if options.methods else list(METHODS)
     cases = sources(options.place, options.count)
@@ -62,6 +63,8 @@ def _measure(options: argparse.Namespace) -> int:
     if not rows:
         raise CalibrationError("no session with truth", where="benchmark", got=options.place, expected="sessions with truth")
     write_results(rows, options.out)
+    if failed := sum(row.outcome == FAILED for row in rows):
+        print(f"{failed} of {len(rows)} measurements failed; the table of failures says why", file=sys.stderr)
     print(f"{len(rows)} measurements, tables and figures in {options.out}")
     return EXIT_DONE
 

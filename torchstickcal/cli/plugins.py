@@ -23,6 +23,8 @@ def import_plugins(plugins: Sequence[str]) -> None:
                 _import_file(Path(plugin))
             else:
                 importlib.import_module(plugin)
+        except CalibrationError:
+            raise
         except (Exception, SystemExit) as error:
             missing = isinstance(error, ModuleNotFoundError)
             raise CalibrationError(

@@ -25,6 +25,8 @@ _FOLD_SEARCH_RADIUS = 8.0
 _FOLD_SEARCH_STEPS = 4096
 _UNDISTORT_ITERATIONS = 50
 _UNDISTORT_TOLERANCE = 1e-13
+_UNDISTORT_ROUNDING = 32.0
+"""Rounding of the distortion, in units of the last place."""
 
 
 class Distorted(NamedTuple):
@@ -283,6 +285,8 @@ class Intrinsics:
         if self.distortion is None:
             return torch.stack([u_target, v_target], dim=-1)
         u, v = u_target.clone(), v_target.clone()
+        rounding = _UNDISTORT_ROUNDING * torch.finfo(u.dtype).eps
+        tolerance = max(_UNDISTORT_TOLERANCE, rounding / 8)
         for _ in range(_UNDISTORT_ITERATIONS):
             lens = self.distort_with_jacobian(u, v)
             error_u, error_v = lens.u - u_target, lens.v - v_target
@@ -290,11 +294,12 @@ class Intrinsics:
             determinant = torch.where(determinant.abs() < 1e-3, torch.full_like(determinant, 1e-3), determinant)
             u = u - (lens.dv_dv * error_u - lens.du_dv * error_v) / determinant
             v = v - (lens.du_du * error_v - lens.dv_du * error_u) / determinant
-            if not bool((torch.maximum(error_u.abs(), error_v.abs()) > _UNDISTORT_TOLERANCE).any()):
+            if not bool((torch.maximum(error_u.abs(), error_v.abs()) > tolerance).any()):
                 break
         back_u, back_v = self.distort(u, v)
         fold_radius = _broadcast(self._fold_radius, u.ndim)
-        solved = ((back_u - u_target).abs() + (back_v - v_target).abs() < 1e-9) & (u * u + v * v < fold_radius**2)
+        exact = (back_u - u_target).abs() + (back_v - v_target).abs() < max(1e-9, rounding)
+        solved = exact & (u * u + v * v < fold_radius**2)
         return torch.where(solved[..., None], torch.stack([u, v], dim=-1), torch.nan)
 
     def _pixel_map(self, ndim: int) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:

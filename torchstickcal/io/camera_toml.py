@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import json
 import re
-import tomllib
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +16,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchstickcal.files import atomic_path
+from torchstickcal.files import atomic_path, parse_toml
 from torchstickcal.io.formats import calibration_reader, calibration_writer, reading
 from torchstickcal.io.rig import Rig
 from torchstickcal.result import Calibration
@@ -25,7 +24,7 @@ from torchstickcal.result import Calibration
 _NAME = "pose2sim"
 _DESCRIPTION = "cameras of Pose2Sim or aniposelib, in metres (.toml)"
 _NOT_CAMERAS = {"metadata", "capture_volume", "charuco", "checkerboard"}
-_CAMERA_TABLE = re.compile(rb"^\[[^\[\].]+\]\s*\n(?:(?!\[).*\n)*?matrix\s*=", re.MULTILINE)
+_CAMERA_TABLE = re.compile(rb"^(?:\xef\xbb\xbf)?\[[^\[\].]+\]\s*\n(?:(?!\[).*\n)*?matrix\s*=", re.MULTILINE)
 """A top-level table with a camera matrix."""
 
 
@@ -96,7 +95,7 @@ def read_camera_toml(path: str | Path) -> Rig:
         (('left',), [[0.0, 0.0, 2.5]])
     """
     with reading(path, _DESCRIPTION):
-        tables: dict[str, Any] = tomllib.loads(Path(path).read_text("utf-8"))
+        tables: dict[str, Any] = parse_toml(Path(path).read_bytes())
         cameras = {key: table for key, table in tables.items() if key not in _NOT_CAMERAS}
         if not cameras:
             raise KeyError("table of a camera")

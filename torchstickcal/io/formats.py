@@ -37,11 +37,13 @@ class Reader(Generic[_Content]):
         recognises: whether a path is of this format, decided by its content. It is called with the path and with the first
             :data:`HEAD_BYTES` bytes of the file (all of a shorter file, none of a folder).
         description: the format in one line.
+        is_content: whether a value is what such a function returns.
     """
 
     function: Callable[[Path], _Content]
     recognises: Callable[[Path, bytes], bool]
     description: str
+    is_content: Callable[[object], bool]
 
     def read(self, path: str | Path) -> _Content:
         """The content of a file or a folder.
@@ -52,7 +54,22 @@ class Reader(Generic[_Content]):
             OSError: if it cannot be opened.
         """
         with reading(path, self.description):
-            return self.function(Path(path))
+            content = self.function(Path(path))
+        if not self.is_content(content):
+            raise FileFormatError(
+                "a reader returns something else than it should",
+                where=f"{self.function.__module__}.{self.function.__name__}",
+                got=type(content).__name__,
+                expected="for a session (Observations, Truth or None), for a calibration a Rig",
+            )
+        return content
+
+    def takes(self, path: Path, head: bytes) -> bool:
+        """Whether it recognises a path; not where it fails to decide."""
+        try:
+            return self.recognises(path, head)
+        except Exception:
+            return False
 
 
 @dataclass(frozen=True)
@@ -116,7 +133,7 @@ def session_reader(
     """
 
     def register(function: _SessionFunction) -> _SessionFunction:
-        SESSION_READERS.register(name, Reader(function, recognises, description), replace=replace)
+        SESSION_READERS.register(name, Reader(function, recognises, description, _is_session), replace=replace)
         return function
 
     return register
@@ -161,7 +178,7 @@ def calibration_reader(
     """
 
     def register(function: _RigFunction) -> _RigFunction:
-        CALIBRATION_READERS.register(name, Reader(function, recognises, description), replace=replace)
+        CALIBRATION_READERS.register(name, Reader(function, recognises, description, _is_rig), replace=replace)
         return function
 
     return register
@@ -306,7 +323,7 @@ def find_reader(path: str | Path, *registries: Registry[Any]) -> Reader[Any]:
     head = b"" if path.is_dir() else _head(path)
     for registry in registries:
         for reader in reversed(tuple(registry.values())):
-            if reader.recognises(path, head):
+            if reader.takes(path, head):
                 return reader
     known = (f"{name} = {reader.description}" for registry in registries for name, reader in registry.items())
     raise FileFormatError(
@@ -346,6 +363,17 @@ def reading(path: str | Path, expected: str) -> Iterator[None]:
         raise FileFormatError(
             "a file is damaged or not of the expected format", where=str(path), got=got, expected=expected
         ) from error
+
+
+def _is_session(content: object) -> bool:
+    if not isinstance(content, tuple) or len(content) != 2:
+        return False
+    observations, truth = content
+    return isinstance(observations, Observations) and isinstance(truth, Truth | None)
+
+
+def _is_rig(content: object) -> bool:
+    return isinstance(content, Rig)
 
 
 def _head(path: Path) -> bytes:

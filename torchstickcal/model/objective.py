@@ -43,7 +43,8 @@ class Objective:
         self.losses = dict(losses)
         self._camera_point = self._of_kind(CameraPointLoss)
         frame = self._of_kind(FrameLoss)
-        self.groups = {name: loss.groups(measurements.sticks) for name, loss in frame.items()}
+        points = measurements.points_per_frame
+        self.groups = {name: loss.checked_groups(measurements.sticks, points) for name, loss in frame.items()}
         """the points (G, k) that each frame loss couples"""
         self._frame = {name: loss for name, loss in frame.items() if len(self.groups[name])}
         self._track = {n: loss for n, loss in self._of_kind(TrackLoss).items() if len(loss.stencil) <= measurements.frames}
@@ -200,8 +201,8 @@ class _UnknownsAt:
         """None where nothing but the poses is unknown."""
         return self if self.unknowns.count else None
 
-    def columns(self, u: Tensor, v: Tensor, pixel: PixelMap) -> tuple[Tensor, Tensor]:
-        return self.unknowns.columns(u, v, pixel, self.cameras, self.motion)
+    def projection_derivatives(self, u: Tensor, v: Tensor, pixel: PixelMap) -> tuple[Tensor, Tensor]:
+        return self.unknowns.projection_derivatives(u, v, pixel, self.cameras, self.motion)
 
     def moved(self, deviations: Tensor) -> tuple[Intrinsics, Tensor]:
         moved = self.at(deviations)

@@ -75,7 +75,7 @@ class Adjustment:
         return Exposures.stack([Exposures.of(frames, self.window) for frames in self.frames])
 
     @property
-    def cameras(self) -> StageResult:
+    def last_camera_stage(self) -> StageResult:
         """Where the last stage that estimated cameras ended."""
         return self.results[0]
 
@@ -204,7 +204,7 @@ def begin(
         if start is not None:
             known = begun.measurements.keeping(start.inliers.flatten(1)[None])
             support = Support.of(known, state, start.sigma_px[None].double())
-            begun = replace(begun, measurements=begun.exposures.on_common_frames(seen, state, support))
+            begun = replace(begun, measurements=begun.exposures.at_common_times(seen, state, support))
     run.took(_INITIALISE, time.perf_counter() - began)
     return begun
 
@@ -238,7 +238,7 @@ def adjust_again(adjustment: Adjustment, run: Run, refined: Sequence[str]) -> Ad
     if seen.unknowns.clocked and not adjustment.asynchronous:
         measurements = adjustment.exposures.unmoved(seen)
     if adjustment.asynchronous:
-        measurements = adjustment.exposures.on_common_frames(seen, state, adjustment.support)
+        measurements = adjustment.exposures.at_common_times(seen, state, adjustment.support)
     again = replace(adjustment, refined=tuple(refined), seen=seen, measurements=measurements, state=state)
     if set(refined) - set(adjustment.refined) <= clock_refinements():
         result = again.last._replace(state=state, minimum=replace(again.last.minimum, unknowns=values))

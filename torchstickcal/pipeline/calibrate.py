@@ -13,7 +13,7 @@ from torchstickcal.pipeline.adjust import adjust_points
 from torchstickcal.pipeline.check import CameraCheck
 from torchstickcal.pipeline.conclude import conclude
 from torchstickcal.pipeline.run import Run
-from torchstickcal.pipeline.session import Session
+from torchstickcal.pipeline.selection import ModelSelection
 from torchstickcal.result import Calibration
 from torchstickcal.solvers import IterationRecord, ignore_record
 from torchstickcal.workers import on_worker
@@ -73,26 +73,26 @@ def calibrate(
 def _calibrated(observations: Observations, config: Config, callback: Callback | None) -> Calibration:
     began = time.perf_counter()
     run = Run(config, callback.on_iteration if callback else ignore_record)
-    session = Session(observations, run)
+    models = ModelSelection(observations, run)
 
     # 1. Synchronise: where the cameras' frames clearly do not belong together, find the time offsets.
-    clocks = session.searched() if "time_offset" in session.allowed and session.unsynchronised else None
+    clocks = models.searched() if "time_offset" in models.allowed and models.unsynchronised else None
 
     # 2. Initialise rig and points, and 3. adjust them in stages, at the time offsets at which the views fit together best.
-    adjusted, clocks = session.adjusted(clocks)
+    adjusted, clocks = models.adjusted(clocks)
 
     # 4. Check the given lenses and clocks; with refine="auto", estimate what the keypoints contradict.
     check = CameraCheck(adjusted, config.camera_groups)
     if config.refine == "auto":
-        adjusted, check = session.refined_where_contradicted(adjusted, check)
+        adjusted, check = models.refined_where_contradicted(adjusted, check)
 
     # 5. Trajectories: with the cameras fixed, smooth each point as its noise and its motion demand.
     ended = adjust_points(adjusted, run)
 
     # 6. Conclude: covariance, warnings, and the result in the caller's dtype.
-    contradicted = config.synchronise and "time_offset" not in ended.refined and session.unsynchronised
+    unsynchronised = config.synchronise and "time_offset" not in ended.refined and models.unsynchronised
     run.took("total", time.perf_counter() - began)
-    calibration = conclude(ended, check, clocks, contradicted, run.seconds)
+    calibration = conclude(ended, check, clocks, unsynchronised, run.seconds)
     if callback:
         callback.on_end(calibration)
     return calibration

@@ -51,13 +51,13 @@ class CameraCheck:
         part = adjustment.within(_CHECKED_FRAMES)
         result, state = part.last, part.state
         support = part.support
-        kept = part.exposures.on_common_frames(part.seen, state, support).keeping(result.inliers)
+        kept = part.exposures.at_common_times(part.seen, state, support).keeping(result.inliers)
         cameras = kept.cameras_at(state).to(torch.float64)
         self._cameras, self._groups = cameras, groups
         self._variants = {unknown.name: next(iter(unknown.variants)) for unknown in all_unknowns().values()}
         self._every = RigUnknowns.of(tuple(self._variants.values()), cameras, groups)
         examined = _with_every_unknown(kept, state, self._every)
-        objective = likelihood(examined, part.cameras.losses, result.sigma_px)
+        objective = likelihood(examined, part.last_camera_stage.losses, result.sigma_px)
         system = NormalEquations(objective, replace(state, unknowns=self._every.given), cameras_free=True)
         self._information, self._gradient = system.reduced[0], system.reduced_gradient[0]
         correlation = residual_correlation(kept, state, result.sigma_px)

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 import torch
 from torch import Tensor
 
-from torchstickcal.model.unknowns import Estimate, all_unknowns
+from torchstickcal.model.unknowns import RigEstimate, all_unknowns
 from torchstickcal.pipeline.adjust import Adjustment
 from torchstickcal.pipeline.check import CameraCheck
 from torchstickcal.pipeline.synchronise import ClockEstimate, CommonFrames
@@ -81,12 +81,12 @@ def _residuals(ended: Adjustment) -> Tensor:
 
 def _covariance(ended: Adjustment) -> Tensor:
     """Covariance of the cameras' tangents and further unknowns where they were estimated last; NaN if they never were."""
-    cameras, measurements = ended.cameras, ended.measurements
-    if cameras.stage.cameras != "free":
+    last, measurements = ended.last_camera_stage, ended.measurements
+    if last.stage.cameras != "free":
         size = 6 * (measurements.num_cameras - 1) + measurements.unknowns.count
         return torch.full((size, size), torch.nan, dtype=torch.float64, device=measurements.pixels.device)
-    kept = measurements.keeping(cameras.inliers)
-    return camera_covariance(likelihood(kept, cameras.losses, ended.last.sigma_px), cameras.state)[0]
+    kept = measurements.keeping(last.inliers)
+    return camera_covariance(likelihood(kept, last.losses, ended.last.sigma_px), last.state)[0]
 
 
 def _unknowns(ended: Adjustment, check: CameraCheck, covariance: Tensor) -> dict[str, CameraParameter]:
@@ -95,7 +95,7 @@ def _unknowns(ended: Adjustment, check: CameraCheck, covariance: Tensor) -> dict
     found = {name: own[0] for name, own in measurements.unknowns.by_name(ended.state.unknowns).items()}
     variances, suggestions = measurements.unknowns.variances(covariance), check.suggestions()
     zero = measurements.cameras.focal_px[0].new_zeros(measurements.num_cameras)
-    estimate = Estimate(
+    estimate = RigEstimate(
         given=measurements.cameras[0],
         found=measurements.cameras_at(ended.state).to(torch.float64)[0],
         frame_period_s=torch.nan if frames.rate_hz is None else 1 / frames.rate_hz,

@@ -64,19 +64,19 @@ def _keypoints(ended: Adjustment) -> list[str]:
 def _contradicted(observations: Observations, unknown: CameraUnknown, parameter: CameraParameter) -> list[str]:
     """Given values that the keypoints contradict."""
     guessed = unknown.family == "lens" and not observations.intrinsics_known
-    if unknown.noticeable is None or guessed or (parameter.refined and unknown.family == "clock"):
+    if unknown.noticeable_prior_share is None or guessed or (parameter.refined and unknown.family == "clock"):
         return []
     names = ("value", "std") if parameter.refined else ("suggested", "suggested_std")
     first = (parameter.by_component(name)[:, 0].tolist() for name in (*names, "given", "prior_std"))
     found: list[str] = []
     for camera, (value, std, given, prior_std) in enumerate(zip(*first, strict=True)):
-        if abs(value - given) > max(_CONTRADICTED_SIGMAS * std, unknown.noticeable * prior_std):
+        if abs(value - given) > max(_CONTRADICTED_SIGMAS * std, unknown.noticeable_prior_share * prior_std):
             what = f"{observations.camera_label(camera)}: {unknown.label} {_quantity(value, std, unknown.unit)}"
             if parameter.refined:
-                found.append(f"{what} found, where {_quantity(given, None, unknown.unit)} was given.")
+                found.append(f"{what} estimated, {_quantity(given, None, unknown.unit)} was given.")
             else:
                 found.append(
-                    f"{what} by the keypoints, but {_quantity(given, None, unknown.unit)} was given and used. "
+                    f"{what} suggested by the keypoints, but {_quantity(given, None, unknown.unit)} was given and used. "
                     f"Check it, or estimate it (refine {next(iter(unknown.variants))!r})."
                 )
     return found

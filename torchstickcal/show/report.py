@@ -29,7 +29,7 @@ def table(calibration: Calibration) -> str:
     text = [_aligned(rows), ""]
     for name, parameter in calibration.unknowns.items():
         known = bool(parameter.by_component("suggested").isfinite().any())
-        if known and (parameter.refined or all_unknowns()[name].noticeable is not None):
+        if known and (parameter.refined or all_unknowns()[name].noticeable_prior_share is not None):
             text += [_aligned(_parameter_rows(calibration, parameter)), ""]
     if calibration.sticks:
         rows = [["stick", "given (m)", "mean (m)", "spread (mm)", "frames"]]

@@ -2,8 +2,8 @@
 
 Example:
     >>> from torchstickcal.simulate import SPORTS, SessionSpec
-    >>> sorted(SPORTS)
-    ['baseball', 'golf', 'hockey', 'kendo', 'wand']
+    >>> {"baseball", "golf", "hockey", "kendo", "wand"} <= set(SPORTS)
+    True
     >>> session = SessionSpec("swing", sport="golf", cameras=4, frames=60).generate()
     >>> session.observations.num_cameras
     4

@@ -7,6 +7,7 @@ from dataclasses import replace
 from torchstickcal.errors import CalibrationError
 from torchstickcal.io import Truth
 from torchstickcal.observations import Observations
+from torchstickcal.registry import suggestion
 from torchstickcal.simulate.clocks import Clocks
 from torchstickcal.simulate.cube import Cube
 from torchstickcal.simulate.motions import SPORTS
@@ -71,8 +72,9 @@ def session_specs(name: str, count: int | None = None, seed: int = 0) -> tuple[S
         [('kendo_5', 5), ('kendo_6', 6)]
     """
     if name not in PRESETS and name not in SPORTS:
+        near = suggestion(name, [*PRESETS, *SPORTS])
         known = f"a preset ({', '.join(PRESETS)}) or a sport ({', '.join(SPORTS)})"
-        raise CalibrationError("no preset or sport of that name", where="name", got=repr(name), expected=known)
+        raise CalibrationError("no preset or sport of that name", where="name", got=repr(name), expected=known, remedy=near)
     if count is not None and count < 1:
         raise CalibrationError("no sessions to simulate", where="count", got=count, expected="1 or more")
     if seed < 0:

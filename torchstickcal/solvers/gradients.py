@@ -20,6 +20,7 @@ from torch.nn.functional import pad
 
 from torchstickcal.errors import ConfigError
 from torchstickcal.geometry.cameras import Intrinsics
+from torchstickcal.losses import Quadratic
 from torchstickcal.model.objective import Objective
 from torchstickcal.model.state import State
 from torchstickcal.solvers.elimination.normal_equations import NormalEquations
@@ -151,7 +152,19 @@ def attach(objective: Objective, minimum: State, mode: GradientMode, fixed: Stat
         mode: how to solve the linear system of the backward pass.
         fixed: if the cameras were held fixed, the state with their rotations, translations, lens and clock unknowns, which may
             require gradients; None if they were estimated.
+
+    Raises:
+        ConfigError: if the gradients are to be exact, and a track loss has a robust kernel, whose curvature is not computed.
     """
+    curved = [name for name, loss in objective.track_losses.items() if not isinstance(loss.kernel, Quadratic)]
+    if curved and isinstance(mode, Implicit):
+        raise ConfigError(
+            "exact gradients need track losses without a robust kernel",
+            where=f"loss {', '.join(curved)}",
+            got=", ".join(type(objective.track_losses[name].kernel).__name__ for name in curved),
+            expected="no kernel",
+            remedy="Or choose gradient='gauss_newton', an approximation.",
+        )
     m, rig = objective.measurements, fixed or minimum
     cameras = (rig.rotations, rig.translations, rig.unknowns)
     data = (m.pixels, m.confidence, m.lengths_m, m.cameras.matrix, m.cameras.distortion, m.unknowns.prior_sigma)

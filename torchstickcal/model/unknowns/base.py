@@ -59,7 +59,7 @@ class View(NamedTuple):
     """motion of the keypoints; None where no clock is unknown"""
 
 
-class Estimate(NamedTuple):
+class RigEstimate(NamedTuple):
     """Where an estimated rig ended, for :meth:`CameraUnknown.in_units`."""
 
     given: Intrinsics
@@ -110,25 +110,29 @@ class CameraUnknown(ABC):
     """``auto`` tries every combination of the unknowns of one family"""
     tried_by_auto: ClassVar[bool] = True
     """whether ``auto`` may refine it"""
-    noticeable: ClassVar[float | None] = None
-    """difference from the given value from which on a contradiction is worth a warning, as a fraction of the prior's standard
-    deviation; None for no warning"""
+    noticeable_prior_share: ClassVar[float | None] = None
+    """difference from the given value that is worth a warning, as a fraction of the prior's standard deviation; None for no
+    warning"""
 
     @abstractmethod
     def prior(self, cameras: Intrinsics) -> Tensor:
         """Standard deviation of the deviations before anything was seen, (..., C, n)."""
 
     def applied(self, cameras: Intrinsics, deviations: Tensor) -> Intrinsics:
-        """The cameras at deviations (..., C, n). Deviations add up: applying a and then b is applying a + b."""
+        """The cameras at deviations (..., C, n).
+
+        Deviations add up: applying a and then b is applying a + b. The order in which different unknowns are applied does not
+        matter: write what adds to a multiple of the focal length as a fraction of it. :func:`register_unknown` tries both.
+        """
         del deviations
         return cameras
 
     @abstractmethod
-    def columns(self, view: View) -> tuple[Tensor, Tensor]:
+    def projection_derivatives(self, view: View) -> tuple[Tensor, Tensor]:
         """Derivatives of the projections (x, y) by the deviations, each (..., C, n, N) or (..., C, n, 1), pixels."""
 
     @abstractmethod
-    def in_units(self, estimate: Estimate) -> InUnits:
+    def in_units(self, estimate: RigEstimate) -> InUnits:
         """The numbers in the unknown's unit."""
 
 
@@ -148,7 +152,16 @@ class LensUnknown(CameraUnknown):
     def values(self, cameras: Intrinsics) -> Tensor:
         """The numbers of cameras in the unknown's unit, (..., C, n)."""
 
-    def columns(self, view: View) -> tuple[Tensor, Tensor]:
+    def value_derivatives(self, cameras: Intrinsics) -> Tensor:
+        """Derivative of each of :meth:`values` by its deviation, (..., C, n)."""
+
+        def values(deviations: Tensor) -> tuple[Tensor]:
+            return (self.values(self.applied(cameras, deviations)),)
+
+        zero = torch.zeros_like(self.values(cameras))
+        return torch.stack([_derivative(values, zero, n)[0][..., n] for n in range(len(self.components))], dim=-1)
+
+    def projection_derivatives(self, view: View) -> tuple[Tensor, Tensor]:
         def projection(deviations: Tensor) -> tuple[Tensor, Tensor]:
             return self.applied(view.cameras, deviations).pixels(view.u, view.v)
 
@@ -157,20 +170,15 @@ class LensUnknown(CameraUnknown):
         x, y = (torch.stack(axis, dim=-2) for axis in zip(*found, strict=True))
         return x, y
 
-    def in_units(self, estimate: Estimate) -> InUnits:
-        def value(deviations: Tensor) -> tuple[Tensor]:
-            return (self.values(self.applied(estimate.found, deviations)),)
-
-        found = self.values(estimate.found)
-        zero = torch.zeros_like(found)
-        by_component = [_derivative(value, zero, n)[0][..., n] for n in range(len(self.components))]
-        return InUnits(found, self.values(estimate.given), torch.stack(by_component, dim=-1))
+    def in_units(self, estimate: RigEstimate) -> InUnits:
+        return InUnits(self.values(estimate.found), self.values(estimate.given), self.value_derivatives(estimate.found))
 
 
 class ClockUnknown(CameraUnknown):
     """An unknown that says when a camera exposed its images: its deviations are counted in frames, its values in seconds.
 
-    The derivative of a keypoint is its motion in the image times :meth:`factor`.
+    The derivative of a keypoint is its motion in the image times :meth:`factor`, which depends on its row in the image, not
+    on its frame. ``readout.py`` is an example.
     """
 
     family = "clock"
@@ -179,7 +187,7 @@ class ClockUnknown(CameraUnknown):
     """standard deviation of the deviation before anything was seen, frames"""
 
     @staticmethod
-    def seconds(frames: Tensor, estimate: Estimate) -> Tensor:
+    def seconds(frames: Tensor, estimate: RigEstimate) -> Tensor:
         """Frames as seconds; NaN where the frame rate is not known, but for zero."""
         return torch.where(frames == 0, 0.0, frames * estimate.frame_period_s)
 
@@ -190,7 +198,7 @@ class ClockUnknown(CameraUnknown):
     def prior(self, cameras: Intrinsics) -> Tensor:
         return torch.full_like(cameras.focal_px, self.prior_frames).unsqueeze(-1)
 
-    def columns(self, view: View) -> tuple[Tensor, Tensor]:
+    def projection_derivatives(self, view: View) -> tuple[Tensor, Tensor]:
         assert view.motion is not None
         x, y = (view.motion.velocity * self.factor(view.motion.row).unsqueeze(-2)).unbind(-2)
         return x.unsqueeze(-2), y.unsqueeze(-2)
@@ -218,9 +226,12 @@ def register_unknown(unknown: type[_Unknown], *, replace: bool = False) -> type[
         replace: whether the names may already be taken, as when a notebook's cell runs again.
 
     Raises:
-        ConfigError: if a name is taken.
+        ConfigError: if a name is taken, or if the unknown, tried on some cameras, does not do what :class:`CameraUnknown` says.
     """
+    from torchstickcal.model.unknowns.trial import try_unknown
+
     instance = unknown()
+    try_unknown(instance, [refinement.unknown for refinement in REFINEMENTS.registered().values()], replace)
     for name, sharing in unknown.variants.items():
         REFINEMENTS.register(name, Refinement(instance, sharing), replace=replace)
     return unknown

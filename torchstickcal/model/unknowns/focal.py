@@ -22,7 +22,7 @@ class Focal(LensUnknown):
     unit = "px"
     components = ("focal",)
     variants = {"focal": Sharing.OWN, "focal_shared": Sharing.GROUP}
-    noticeable = 0.05
+    noticeable_prior_share = 0.05
 
     def prior(self, cameras: Intrinsics) -> Tensor:
         return torch.full_like(cameras.focal_px, _PRIOR).unsqueeze(-1)
@@ -32,10 +32,13 @@ class Focal(LensUnknown):
         factor = others + (1 - others) * deviations.exp()[..., None]
         return replace(cameras, matrix=cameras.matrix * factor)
 
-    def columns(self, view: View) -> tuple[Tensor, Tensor]:
+    def projection_derivatives(self, view: View) -> tuple[Tensor, Tensor]:
         centre = view.cameras.matrix[..., :2, 2:]
         x, y = view.pixel.x - centre[..., 0, :], view.pixel.y - centre[..., 1, :]
         return x.unsqueeze(-2), y.unsqueeze(-2)
 
     def values(self, cameras: Intrinsics) -> Tensor:
         return cameras.focal_px.unsqueeze(-1)
+
+    def value_derivatives(self, cameras: Intrinsics) -> Tensor:
+        return self.values(cameras)

@@ -30,9 +30,12 @@ class PrincipalPoint(LensUnknown):
         shift = torch.nn.functional.pad(deviations.unsqueeze(-1), (2, 0, 0, 1))
         return replace(cameras, matrix=cameras.matrix + shift)
 
-    def columns(self, view: View) -> tuple[Tensor, Tensor]:
+    def projection_derivatives(self, view: View) -> tuple[Tensor, Tensor]:
         one, zero = torch.ones_like(view.cameras.matrix[..., :1, :1]), torch.zeros_like(view.cameras.matrix[..., :1, :1])
         return torch.cat([one, zero], dim=-2), torch.cat([zero, one], dim=-2)
 
     def values(self, cameras: Intrinsics) -> Tensor:
         return cameras.matrix[..., :2, 2]
+
+    def value_derivatives(self, cameras: Intrinsics) -> Tensor:
+        return torch.ones_like(self.values(cameras))

@@ -32,9 +32,9 @@ class Radial(LensUnknown):
             given = cameras.matrix.new_zeros(*cameras.matrix.shape[:-2], 4)
         return replace(cameras, distortion=given + torch.nn.functional.pad(deviations, (0, given.shape[-1] - 2)))
 
-    def columns(self, view: View) -> tuple[Tensor, Tensor]:
+    def projection_derivatives(self, view: View) -> tuple[Tensor, Tensor]:
         if view.cameras.is_tilted:
-            return super().columns(view)
+            return super().projection_derivatives(view)
         first, second = (view.cameras.pixels_by_radial(view.u, view.v, order) for order in (1, 2))
         x, y = (torch.stack(axis, dim=-2) for axis in zip(first, second, strict=True))
         return x, y
@@ -43,3 +43,6 @@ class Radial(LensUnknown):
         if cameras.distortion is None:
             return torch.zeros_like(cameras.matrix[..., :2, 0])
         return cameras.distortion[..., :2]
+
+    def value_derivatives(self, cameras: Intrinsics) -> Tensor:
+        return torch.ones_like(self.values(cameras))

@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from torchstickcal.model.unknowns.base import ClockUnknown, Estimate, InUnits, Sharing, register_unknown
+from torchstickcal.model.unknowns.base import ClockUnknown, InUnits, RigEstimate, Sharing, register_unknown
 
 
 @register_unknown
@@ -21,7 +21,7 @@ class Readout(ClockUnknown):
     def factor(self, row: Tensor) -> Tensor:
         return row
 
-    def in_units(self, estimate: Estimate) -> InUnits:
+    def in_units(self, estimate: RigEstimate) -> InUnits:
         correction = self.seconds(estimate.deviations[self.name], estimate)
         given = torch.full_like(correction, estimate.readout_s)
         return InUnits(given + correction, given, torch.full_like(correction, estimate.frame_period_s))

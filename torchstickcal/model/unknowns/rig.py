@@ -144,7 +144,7 @@ class RigUnknowns:
             return pixels
         return pixels - motion.velocity * self.delays(motion.row, values - motion.reference).unsqueeze(-2)
 
-    def columns(
+    def projection_derivatives(
         self, u: Tensor, v: Tensor, pixel: PixelMap, cameras: Intrinsics, motion: ImageMotion | None
     ) -> tuple[Tensor, Tensor]:
         """Derivatives of projections (x, y) by each camera's own values, each (B, C, k, N).
@@ -156,7 +156,7 @@ class RigUnknowns:
             motion: of the keypoints, where clocks are among the unknowns.
         """
         view = View(u, v, pixel, cameras, motion)
-        found = [unknown.columns(view) for unknown in self.unknowns]
+        found = [unknown.projection_derivatives(view) for unknown in self.unknowns]
         points = u.shape[-1]
         x, y = (torch.cat([c.expand(*c.shape[:-1], points) for c in axis], dim=-2) for axis in zip(*found, strict=True))
         return x, y

@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from torchstickcal.model.unknowns.base import ClockUnknown, Estimate, InUnits, Sharing, register_unknown
+from torchstickcal.model.unknowns.base import ClockUnknown, InUnits, RigEstimate, Sharing, register_unknown
 
 
 @register_unknown
@@ -20,12 +20,12 @@ class TimeOffset(ClockUnknown):
     components = ("time_offset",)
     variants = {"time_offset": Sharing.RELATIVE}
     prior_frames = 0.5
-    noticeable = 0.04
+    noticeable_prior_share = 0.04
 
     def factor(self, row: Tensor) -> Tensor:
         return torch.ones_like(row)
 
-    def in_units(self, estimate: Estimate) -> InUnits:
+    def in_units(self, estimate: RigEstimate) -> InUnits:
         readout = self.seconds(estimate.deviations["readout"], estimate)
         middle = self.seconds(estimate.frame_offsets[:, None] + estimate.deviations[self.name], estimate)
         period = torch.full_like(middle, estimate.frame_period_s)

@@ -45,7 +45,7 @@ def synchronise_keypoints(
     unfinished = torch.ones(detected.sessions, dtype=torch.bool, device=detected.pixels.device)
     records: list[list[StageRecord]] = [[] for _ in range(detected.sessions)]
     for number in range(_MAX_ROUNDS):
-        moved = exposures.on_common_frames(detected, result.state, support)
+        moved = exposures.at_common_times(detected, result.state, support)
         if number > 0:
             unfinished = _have_moved(moved, measurements, result)
         measurements = moved

@@ -84,7 +84,7 @@ class Exposures:
         velocity = torch.zeros_like(measurements.pixels)
         return replace(measurements, motion=self._motion(velocity, measurements.unknowns.given))
 
-    def on_common_frames(self, measurements: Measurements, state: State, support: Support) -> Measurements:
+    def at_common_times(self, measurements: Measurements, state: State, support: Support) -> Measurements:
         """Measurements with the keypoints moved to the common frames.
 
         The error of the interpolation lowers the confidence of a keypoint.

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 
+from torchstickcal.errors import ConfigError
 from torchstickcal.registry import Registry
 
 Plane = tuple[tuple[float, float, float], tuple[float, float, float]]
@@ -28,7 +30,8 @@ class Posture:
         chest_turn: of the chest relative to the athlete's heading, about the spine. chest_lean, chest_side: likewise.
         head_turn: of the head relative to the athlete's heading. head_nod: likewise, positive forward.
         arms_angle: direction from the midpoint of the shoulders to the midpoint of the grips, as an angle in the action's
-            swing plane. arms_elevation: of that direction out of the swing plane. arms_reach_m: the distance.
+            swing plane: 0 is the lowest direction of the plane, 90 to the left, -90 to the right, 180 overhead.
+            arms_elevation: of that direction out of the swing plane. arms_reach_m: the distance.
         stick_angle: angle in the swing plane from the direction of the arms to that of the stick.
         stick_elevation: of the stick out of the swing plane.
         left_foot: position of the left sole (below the ankle) relative to the athlete's position on the floor, metres.
@@ -69,6 +72,9 @@ class Action:
         period_s: duration of a repetition, seconds; after it the first posture comes again.
         walk_s: interval within the repetition, seconds, in which the athlete may walk.
 
+    Raises:
+        ConfigError: for times that do not increase from 0 within the period, and for grips that are not on the stick.
+
     Example:
         >>> from torchstickcal.simulate import Action, Posture, tilted_plane
         >>> ready, hit = Posture(arms_angle=-60), Posture(arms_angle=60)
@@ -93,6 +99,24 @@ class Action:
     period_s: float
     walk_s: tuple[float, float]
 
+    def __post_init__(self) -> None:
+        times = [time for time, _ in self.keys]
+        if not times or times[0] != 0 or any(late <= early for early, late in pairwise([*times, self.period_s])):
+            got = f"{times}, period_s = {self.period_s}"
+            raise ConfigError(
+                "unusable times", where="Action.keys", got=got, expected="0, and then increasing up to the period"
+            )
+        if not 0 <= self.walk_s[0] < self.walk_s[1] <= self.period_s:
+            expected = f"start and end between 0 and {self.period_s}"
+            raise ConfigError("unusable interval", where="Action.walk_s", got=self.walk_s, expected=expected)
+        if not self.grips_m or not set(self.grips_m) <= {"left", "right"}:
+            raise ConfigError(
+                "unknown hand", where="Action.grips_m", got=list(self.grips_m), expected="'left', 'right' or both"
+            )
+        if not all(0 <= grip_m <= self.stick_m for grip_m in self.grips_m.values()):
+            expected = f"distances from 0 to {self.stick_m}, the length of the stick"
+            raise ConfigError("a hand beside the stick", where="Action.grips_m", got=dict(self.grips_m), expected=expected)
+
 
 SPORTS: Registry[Action] = Registry("sport", "torchstickcal.simulate.motions")
 """The action of each sport, by name.
@@ -113,8 +137,6 @@ def action(sport: str) -> Action:
     Example:
         >>> action("golf").stick_m
         1.0
-        >>> [name for name in SPORTS if action(name).stick_m < 1]
-        ['baseball', 'wand']
     """
     return SPORTS[sport]
 

@@ -228,7 +228,7 @@ class NormalEquations:
             if unknown_blocks is not None:
                 rows = torch.cat([rows, unknown_blocks], dim=1)
             for row in range(rows.shape[1]):
-                response[:, row][..., part.columns] = -elimination.solve(rows[:, row])
+                response[:, row][..., part.columns] = -elimination.solve(rows[:, row]).to(response)
         return response
 
     def records(self, stage: str, iterations: list[int], dampings: list[float], steps_m: list[float]) -> list[IterationRecord]:

@@ -1,4 +1,4 @@
-"""One session, adjusted in different ways: at other time offsets, and with more unknown of its cameras."""
+"""Model selection: at which time offsets, and with what unknown of its cameras, a session is adjusted."""
 
 from __future__ import annotations
 
@@ -23,8 +23,8 @@ _FITTING_SHARE, _FITTING_FOCAL_SHARE = 0.6, 0.01
 """Least fraction of inliers, and largest noise as a fraction of the focal length, of cameras that fit together."""
 
 
-class Session:
-    """A session on its way to a calibration.
+class ModelSelection:
+    """One session, adjusted at different time offsets and with different parameters of its cameras refined.
 
     Args:
         observations: the session.
