@@ -16,7 +16,14 @@ from torchstickcal.simulate.session import read_simulated
 TEXT = (Path(__file__).parents[1] / "CONTRIBUTING.md").read_text("utf-8")
 RECIPES = dict(re.findall(r"`[\w/]+/(\w+)\.py`:\n\n```python\n(.*?)```", TEXT, flags=re.DOTALL))
 
-pytestmark = pytest.mark.usefixtures("own_parts")
+NAMES = {"equal_forearms", "aspect", "aspect_shared", "tracks", "positions", "tennis", "stick_and_height"}
+
+
+@pytest.fixture(autouse=True)
+def not_registered(own_parts, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Forget the parts of the recipes, in case they are in their folders."""
+    for registry in own_parts:
+        monkeypatch.setattr(registry, "_things", {name: thing for name, thing in registry.items() if name not in NAMES})
 
 
 def plugin(name: str, folder: Path) -> list[str]:

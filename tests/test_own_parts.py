@@ -103,11 +103,11 @@ class SlowSettings(LossSettings):
 class Aspect(LensUnknown):
     """Ratio of the focal lengths along y and x; the deviation is its logarithm over that of the given ratio."""
 
-    name = "aspect"
+    name = "own_aspect"
     label = "aspect ratio"
     unit = ""
-    components = ("aspect",)
-    variants: ClassVar = {"aspect": Sharing.OWN, "aspect_shared": Sharing.GROUP}
+    components = ("own_aspect",)
+    variants: ClassVar = {"own_aspect": Sharing.OWN, "own_aspect_shared": Sharing.GROUP}
     noticeable_prior_share = 0.1
 
     def prior(self, cameras: Intrinsics) -> Tensor:
@@ -124,7 +124,7 @@ class Aspect(LensUnknown):
 @pytest.fixture
 def registered(own_parts) -> None:
     """The parts above, registered as a user's module would."""
-    register_loss("equal_forearms")(EqualForearms)
+    register_loss("own_forearms")(EqualForearms)
     register_loss("rays")(RaySettings)
     register_loss("slow")(SlowSettings)
     register_unknown(Aspect)
@@ -152,7 +152,7 @@ class TestLoss:
     def test_any_stage_can_name_it_and_both_solvers_minimise_it(self):
         observations, _ = golf_session(cameras=3, frames=20, noise=Noise(2.0))
         plain = calibrate(observations)
-        firm = with_stage_losses(equal_forearms={"sigma_m": 1e-4})
+        firm = with_stage_losses(own_forearms={"sigma_m": 1e-4})
         newton, lbfgs = calibrate(observations, firm), calibrate(observations, firm | {"solver": "lbfgs"})
         assert newton.converged
         assert forearm_difference_m(plain) > 0.005
@@ -173,14 +173,14 @@ class TestLoss:
 
     def test_tensorboard_shows_it(self, tmp_path):
         observations, _ = golf_session(cameras=3, frames=10, noise=Noise(2.0))
-        calibrate(observations, with_stage_losses(equal_forearms={}), TensorBoardMonitor(tmp_path))
+        calibrate(observations, with_stage_losses(own_forearms={}), TensorBoardMonitor(tmp_path))
         log = EventAccumulator(str(tmp_path))
         log.Reload()
-        assert "3 refined/loss/equal_forearms" in log.Tags()["scalars"]
+        assert "3 refined/loss/own_forearms" in log.Tags()["scalars"]
 
     def test_unknown_settings_and_taken_names_are_refused(self):
-        with pytest.raises(ConfigError, match=r"equal_forearms.sigma.*Did you mean 'sigma_m'"):
-            load_config(with_stage_losses(equal_forearms={"sigma": 1.0}))
+        with pytest.raises(ConfigError, match=r"own_forearms.sigma.*Did you mean 'sigma_m'"):
+            load_config(with_stage_losses(own_forearms={"sigma": 1.0}))
         with pytest.raises(ConfigError, match=r"the name is taken .*loss"):
             register_loss("reprojection")(EqualForearms)
 
@@ -217,13 +217,13 @@ class TestLoss:
         monkeypatch.setattr(EqualLengths, method, lambda *arguments: value)
         observations, _ = golf_session(cameras=3, frames=8)
         with pytest.raises(ConfigError, match=rf"EqualLengths.{method}.*{message}"):
-            calibrate(observations, with_stage_losses(equal_forearms={}))
+            calibrate(observations, with_stage_losses(own_forearms={}))
 
     @pytest.mark.parametrize("smooth", [False, True])
     def test_gradients_of_the_layer_are_exact(self, smooth: bool):
         observations, _ = golf_session(cameras=3, frames=8, noise=Noise(2.0))
         reprojection = {"sigma_px": 2.0, "kernel": "cauchy", "kernel_scale": 3.0}
-        metric: dict[str, Any] = {"reprojection": reprojection, "stick_length": {"sigma_m": 0.02}, "equal_forearms": {}}
+        metric: dict[str, Any] = {"reprojection": reprojection, "stick_length": {"sigma_m": 0.02}, "own_forearms": {}}
         if smooth:
             metric |= {"smoothness": {"sigma_m": 0.3}, "slow": {"sigma_m": 0.5}}
         stages = {"unscaled": {"reprojection": reprojection, "rescale": True}, "metric": metric}
@@ -335,7 +335,7 @@ def test_closed_forms_are_the_automatic_ones(disturbed: tuple[Measurements, Stat
 class TestCameraUnknown:
     """The aspect ratio of pixels, 1 % off in every camera."""
 
-    SPEC = SessionSpec("aspect", "hockey", 3, 4, 80, 60.0, "ring", regimes=(GaussianNoise(0.5),))
+    SPEC = SessionSpec("own_aspect", "hockey", 3, 4, 80, 60.0, "ring", regimes=(GaussianNoise(0.5),))
 
     def observations(self):
         given = self.SPEC.generate().observations
@@ -344,10 +344,10 @@ class TestCameraUnknown:
         return replace(given, intrinsics=wrong)
 
     def test_it_is_found_with_an_honest_deviation(self):
-        found = calibrate(self.observations(), refine=["aspect"])
+        found = calibrate(self.observations(), refine=["own_aspect"])
         assert found.converged
-        assert found.refined == ("aspect",)
-        aspect = found.unknowns["aspect"]
+        assert found.refined == ("own_aspect",)
+        aspect = found.unknowns["own_aspect"]
         assert aspect.refined
         assert (aspect.given - 1.01).abs().max() < 1e-12
         assert (aspect.std > 0).all()
@@ -356,18 +356,18 @@ class TestCameraUnknown:
         torch.testing.assert_close(found.intrinsics[:, 1, 1] / found.intrinsics[:, 0, 0], aspect.value)
 
     def test_shared_it_is_one_value(self):
-        value = calibrate(self.observations(), refine=["aspect_shared"]).unknowns["aspect"].value
+        value = calibrate(self.observations(), refine=["own_aspect_shared"]).unknowns["own_aspect"].value
         assert (value == value[0]).all()
 
     def test_auto_tries_it_and_warnings_name_it(self):
-        assert {"aspect", "aspect_shared"} & set(calibrate(self.observations(), refine="auto").refined)
+        assert {"own_aspect", "own_aspect_shared"} & set(calibrate(self.observations(), refine="auto").refined)
         warnings = calibrate(self.observations()).warnings
-        assert any("aspect ratio" in warning and "refine 'aspect'" in warning for warning in warnings)
+        assert any("aspect ratio" in warning and "refine 'own_aspect'" in warning for warning in warnings)
 
     def test_report_and_summary_have_it(self):
-        found = calibrate(self.observations(), refine=["aspect"])
+        found = calibrate(self.observations(), refine=["own_aspect"])
         assert "aspect ratio" in table(found)
-        assert summary(found)["unknowns"]["aspect"]["cameras"][1]["std"]["aspect"] > 0
+        assert summary(found)["unknowns"]["own_aspect"]["cameras"][1]["std"]["own_aspect"] > 0
 
     def test_the_layer_differentiates_by_it(self):
         given = self.observations()
@@ -375,7 +375,7 @@ class TestCameraUnknown:
         known = {"reprojection": {"sigma_px": 0.5}, "reject_sigmas": False}
         stages = dict.fromkeys(("unscaled", "metric", "refined"), known)
         stages["trajectories"] = known | {"smoothness": {"sigma_m": 0.1}}
-        layer = CalibrationLayer(given.sticks, {"extends": "default", "refine": ["aspect"], "stages": stages})
+        layer = CalibrationLayer(given.sticks, {"extends": "default", "refine": ["own_aspect"], "stages": stages})
         result = layer(keypoints, given.cameras)
         (gradient,) = torch.autograd.grad(result.intrinsics[:, 1, 1].sum(), keypoints)
         direction = torch.randn(keypoints.shape, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
