@@ -64,16 +64,16 @@ def fingerprint(name: str) -> str:
 @pytest.fixture
 def tennis(own_parts, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Tennis, registered by a module of the user."""
-    (tmp_path / "my_tennis.py").write_text(TENNIS.replace("NAME", "tennis"))
+    (tmp_path / "my_tennis.py").write_text(TENNIS.replace("NAME", "padel"))
     monkeypatch.syspath_prepend(tmp_path)
     importlib.import_module("my_tennis")
 
 
 def test_a_sport_of_one_s_own_is_simulated(tennis: None, tmp_path: Path):
-    assert action("tennis").stick_m == 0.69
+    assert action("padel").stick_m == 0.69
     out = tmp_path / "sessions"
-    assert main(["simulate", "tennis", "--out", str(out), "--seed", "3"]) == 0
-    session = read_simulated(out / "tennis_3.npz")
+    assert main(["simulate", "padel", "--out", str(out), "--seed", "3"]) == 0
+    session = read_simulated(out / "padel_3.npz")
     assert session.observations.sticks[0].length_m == 0.69
     assert session.observations.point_names is not None
     assert session.observations.point_names[-1] == "racket_tip"
@@ -81,7 +81,7 @@ def test_a_sport_of_one_s_own_is_simulated(tennis: None, tmp_path: Path):
 
 def test_a_sport_of_one_s_own_is_measured(tennis: None, tmp_path: Path):
     """The benchmark finds the regime of a session in front of the sport in its name."""
-    write_simulated(tmp_path / "windy2_tennis_ring.npz", SessionSpec("any", "tennis", cameras=3, frames=10).generate())
+    write_simulated(tmp_path / "windy2_padel_ring.npz", SessionSpec("any", "padel", cameras=3, frames=10).generate())
     case = sources(str(tmp_path))[0].load()
     assert case is not None
     assert case.regime == "windy"
@@ -104,9 +104,9 @@ def test_an_unknown_sport_is_refused_with_the_known_ones():
 
 
 def test_a_new_sport_changes_no_preset(tennis: None):
-    assert "tennis" in SPORTS
+    assert "padel" in SPORTS
     assert {name: fingerprint(name) for name in PRESETS} == FINGERPRINTS
-    assert not any(spec.sport == "tennis" for name in PRESETS for spec in preset(name))
+    assert not any(spec.sport == "padel" for name in PRESETS for spec in preset(name))
 
 
 def test_a_new_sport_changes_no_regime(own_parts):
