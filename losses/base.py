@@ -16,7 +16,7 @@ keep them.
 from __future__ import annotations
 
 import copy
-from typing import Self
+from typing import Any, Self
 
 import torch
 from torch import Tensor, nn
@@ -53,17 +53,13 @@ class Loss(nn.Module):
         """The same loss for some of the sessions, where ``sigma`` has a dimension for them (its first of three or more)."""
         if self.sigma.ndim < 3:
             return self
-        part = copy.deepcopy(self)
-        part.sigma = self.sigma[sessions]
-        return part
+        return self._with(sigma=self.sigma[sessions])
 
     def replaced(self, where: Tensor, other: Self) -> Self:
         """The same loss with the ``sigma`` of some sessions (B,), True where, taken from another loss."""
         if self.sigma.ndim < 3:
             return self
-        mixed = copy.deepcopy(self)
-        mixed.sigma = torch.where(where.view(-1, *[1] * (self.sigma.ndim - 1)), other.sigma, self.sigma)
-        return mixed
+        return self._with(sigma=torch.where(where.view(-1, *[1] * (self.sigma.ndim - 1)), other.sigma, self.sigma))
 
     def information(self, like: Tensor) -> Tensor:
         """1 / sigma^2 in the dtype and on the device of a tensor."""
@@ -80,9 +76,15 @@ class Loss(nn.Module):
         del sigma_px
         if self.weight != 1.0:
             return None
-        normal = copy.deepcopy(self)
-        normal.kernel = Quadratic()
-        return normal
+        return self._with(kernel=Quadratic())
+
+    def _with(self, **attributes: Any) -> Self:
+        """A copy with some attributes changed. Buffers are shared, not copied."""
+        copied = copy.copy(self)
+        copied._buffers = dict(self._buffers)
+        for name, value in attributes.items():
+            setattr(copied, name, value)
+        return copied
 
 
 def checked_residuals(loss: Loss, residuals: Tensor, leading: tuple[int, ...]) -> Tensor:

@@ -10,6 +10,7 @@ from torch import Tensor
 from torch.autograd import forward_ad
 
 from torchstickcal.errors import ConfigError
+from torchstickcal.geometry.symmetric import six_entries
 from torchstickcal.losses.base import Loss, checked_residuals, tangent
 
 
@@ -21,7 +22,9 @@ class FrameTerms(NamedTuple):
     gradient: Tensor
     """(..., k, 3, F, G): half the derivative by each point of the group"""
     hessian: Tensor
-    """(..., k, k, 3, 3, F, G): the blocks between the points of the group"""
+    """(..., k, 6, F, G): the block of each point of the group, entries xx xy xz yy yz zz"""
+    cross: Tensor
+    """(..., k (k - 1) / 2, 3, 3, F, G): the blocks between two points, in the order 01 02 ... 12 ..."""
 
 
 class FrameLoss(Loss, ABC):
@@ -93,8 +96,17 @@ class FrameLoss(Loss, ABC):
         if exact:
             hessian = self._exact_hessian(at, known, lengths_m)
         else:
-            hessian = torch.einsum("...fgmki,...fgmlj,...fg->...klijfg", jacobian, jacobian, weights)
-        return FrameTerms(self.total(whitened, over=2), gradient, hessian)
+            hessian = torch.einsum("...fgmki,...fgmlj,...fg->...fgklij", jacobian, jacobian, weights)
+        blocks = hessian.movedim((-6, -5), (-2, -1))
+        size = groups.shape[1]
+        own = torch.stack([six_entries(blocks[..., i, i, :, :, :, :].flatten(-2)) for i in range(size)], dim=-3)
+        first, second = torch.triu_indices(size, size, offset=1)
+        return FrameTerms(
+            cost=self.total(whitened, over=2),
+            gradient=gradient,
+            hessian=own.unflatten(-1, known.shape[-2:]),
+            cross=blocks[..., first, second, :, :, :, :],
+        )
 
     def slope(self, points: Tensor, moved: Tensor, sticks: Tensor, lengths_m: Tensor, active: Tensor) -> Tensor:
         """Half the derivative of the loss where the points move by (..., 3, F, P), summed; differentiable."""
@@ -123,13 +135,13 @@ class FrameLoss(Loss, ABC):
 
     @torch.enable_grad()
     def _exact_hessian(self, grouped: Tensor, known: Tensor, lengths_m: Tensor) -> Tensor:
-        """Half the second derivatives of the loss, blocks (..., k, k, 3, 3, F, G)."""
+        """Half the second derivatives of the loss, blocks (..., F, G, k, k, 3, 3)."""
         squared = self._squared(grouped, known, lengths_m)
         value = self.total(squared * self.information(squared))
         (gradient,) = torch.autograd.grad(value / 2, grouped, create_graph=True)
         rows = [torch.autograd.grad(row.sum(), grouped, retain_graph=True)[0] for row in gradient.flatten(-2).unbind(-1)]
         blocks = torch.stack(rows, dim=-3).unflatten(-3, grouped.shape[-2:])
-        return torch.einsum("...fgkilj->...klijfg", blocks)
+        return blocks.transpose(-3, -2)
 
     def _squared(self, grouped: Tensor, known: Tensor, lengths_m: Tensor) -> Tensor:
         """Squared residuals (..., G) of points (..., G, k, 3), zero for groups that are not known whole."""

@@ -75,12 +75,12 @@ class StickLengthLoss(FrameLoss):
         entries = outer(direction.flatten(-2)).unflatten(-1, length.shape[-2:]) * (along - across).unsqueeze(-3)
         for entry in DIAGONAL:
             entries[..., entry, :, :] += across
-        block = expand(entries.flatten(-2)).unflatten(-1, length.shape[-2:])
         gradient = direction * (weights * residual).unsqueeze(-3)
         return FrameTerms(
             cost=self.total(squared, over=2),
             gradient=torch.stack([-gradient, gradient], dim=-4),
-            hessian=torch.stack([torch.stack([block, -block], dim=-5), torch.stack([-block, block], dim=-5)], dim=-6),
+            hessian=entries.unsqueeze(-4).expand(*entries.shape[:-3], 2, *entries.shape[-3:]),
+            cross=-expand(entries.flatten(-2)).unflatten(-1, length.shape[-2:]).unsqueeze(-5),
         )
 
     def slope(self, points: Tensor, moved: Tensor, sticks: Tensor, lengths_m: Tensor, active: Tensor) -> Tensor:
@@ -92,10 +92,11 @@ class StickLengthLoss(FrameLoss):
 
     def _between(self, points: Tensor, sticks: Tensor, active: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """From one end to the other (..., 3, F, S), the lengths (..., F, S), and 1 / sigma^2, zero for unknown ends."""
-        starts, ends = points[..., sticks].unbind(-1)
-        difference = ends - starts
+        start, end = sticks.unbind(1)
+        difference = points.index_select(-1, end) - points.index_select(-1, start)
         length = difference.square().sum(-3).clamp_min(_MIN_LENGTH_M**2).sqrt()
-        return difference, length, self.information(length) * active[..., sticks].all(-1)
+        known = active.index_select(-1, start) & active.index_select(-1, end)
+        return difference, length, self.information(length) * known
 
 
 @register_loss("stick_length")

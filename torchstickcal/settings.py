@@ -7,6 +7,7 @@ a name of a registry, another such dataclass, lists and dictionaries of these, a
 from __future__ import annotations
 
 import dataclasses
+import functools
 import sys
 import types
 import typing
@@ -66,7 +67,7 @@ def build_dataclass(kind: type, value: Any, where: str, path: tuple[str, ...]) -
     """A dataclass from a table; arguments and errors as of :func:`build`."""
     if not isinstance(value, dict):
         raise _unusable(value, "a table", where, path)
-    hints, fields = typing.get_type_hints(kind, include_extras=True), dataclasses.fields(kind)
+    hints, fields = _hints(kind), dataclasses.fields(kind)
     for key in value:
         check_key(key, [field.name for field in fields], where, path)
     required = [field.name for field in fields if field.default is field.default_factory is dataclasses.MISSING]
@@ -89,6 +90,12 @@ def check_key(key: object, known: Sequence[str], where: str, path: tuple[str, ..
             expected=f"one of {', '.join(known)}",
             remedy=suggestion(str(key), known),
         )
+
+
+@functools.cache
+def _hints(kind: type) -> dict[str, Any]:
+    """The types of a dataclass's fields."""
+    return typing.get_type_hints(kind, include_extras=True)
 
 
 def _unusable(value: object, expected: str, where: str, path: tuple[str, ...], remedy: str = "") -> ConfigError:

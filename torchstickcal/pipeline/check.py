@@ -54,6 +54,7 @@ class CameraCheck:
         kept = part.exposures.at_common_times(part.seen, state, support).keeping(result.inliers)
         cameras = kept.cameras_at(state).to(torch.float64)
         self._cameras, self._groups = cameras, groups
+        self._choices: dict[tuple[str, ...], tuple[Tensor, RigUnknowns]] = {}
         self._variants = {unknown.name: next(iter(unknown.variants)) for unknown in all_unknowns().values()}
         self._every = RigUnknowns.of(tuple(self._variants.values()), cameras, groups)
         examined = _with_every_unknown(kept, state, self._every)
@@ -97,7 +98,8 @@ class CameraCheck:
         Residuals that are alike from frame to frame count as the smaller number of independent ones that they are worth.
         """
         promised = self._evidence * (self._decrease(names) - self._decrease(()))
-        return promised - _PRICE * RigUnknowns.of(names, self._cameras, self._groups).count
+        _, unknowns = self._chosen(names)
+        return promised - _PRICE * unknowns.count
 
     def _decrease(self, names: tuple[str, ...]) -> float:
         chosen, _ = self._chosen(names)
@@ -114,6 +116,8 @@ class CameraCheck:
 
     def _chosen(self, names: tuple[str, ...]) -> tuple[Tensor, RigUnknowns]:
         """The map from poses and a choice's unknowns to poses and all unknowns, and the choice's unknowns."""
+        if names in self._choices:
+            return self._choices[names]
         unknowns = RigUnknowns.of(names, self._cameras, self._groups)
         poses = torch.eye(len(self._gradient) - self._every.count).to(self._gradient)
         every = [(unknown.name, component) for unknown in self._every.unknowns for component in unknown.components]
@@ -121,7 +125,8 @@ class CameraCheck:
         picked = unknowns.share.new_zeros(len(unknowns.share), len(every), unknowns.count)
         picked[:, [every.index(component) for component in chosen]] = unknowns.share
         means = self._every.share / self._every.share.sum((0, 1))
-        return torch.block_diag(poses, torch.einsum("cki,ckj->ij", means, picked)), unknowns
+        self._choices[names] = torch.block_diag(poses, torch.einsum("cki,ckj->ij", means, picked)), unknowns
+        return self._choices[names]
 
 
 def _with_every_unknown(kept: Measurements, state: State, every: RigUnknowns) -> Measurements:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -48,23 +49,22 @@ class RigUnknowns:
                 got=f"{len(labels)} labels",
                 expected=f"{count}, one for each camera",
             )
-        unknowns: list[CameraUnknown] = []
-        columns: list[tuple[int, list[int]]] = []
-        priors: list[Tensor] = []
-        components = 0
-        for unknown, sharing in (REFINEMENTS[name] for name in names):
-            prior = unknown.prior(cameras)
-            for component in range(len(unknown.components)):
-                for members in _sharing_cameras(sharing, labels):
-                    columns.append((components, members))
-                    priors.append(prior[..., members, component].mean(-1))
-                components += 1
-            unknowns.append(unknown)
-        share = cameras.matrix.new_zeros(count, components, len(columns))
+        chosen = [REFINEMENTS[name] for name in names]
+        columns = [
+            (component, members)
+            for component, sharing in enumerate(sharing for unknown, sharing in chosen for _ in unknown.components)
+            for members in _sharing_cameras(sharing, labels)
+        ]
+        components = sum(len(unknown.components) for unknown, _ in chosen)
+        shared = np.zeros((count, components, len(columns)))
         for column, (component, members) in enumerate(columns):
-            share[members, component, column] = 1.0
-        prior_sigma = torch.stack(priors, dim=-1) if priors else cameras.matrix.new_zeros(sessions, 0)
-        return RigUnknowns(tuple(unknowns), share, prior_sigma)
+            shared[members, component, column] = 1.0
+        share = torch.from_numpy(shared).to(cameras.matrix)
+        priors = torch.cat(
+            [cameras.matrix.new_zeros(sessions, count, 0), *(unknown.prior(cameras) for unknown, _ in chosen)], -1
+        )
+        prior_sigma = torch.einsum("ckj,bck->bj", share, priors) / share.sum((0, 1))
+        return RigUnknowns(tuple(unknown for unknown, _ in chosen), share, prior_sigma)
 
     @staticmethod
     def stack(sessions: Sequence[RigUnknowns]) -> RigUnknowns:

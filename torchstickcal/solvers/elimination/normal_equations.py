@@ -28,7 +28,7 @@ import torch
 from torch import Tensor
 
 from torchstickcal.geometry import se3
-from torchstickcal.geometry.symmetric import DIAGONAL, IDENTITY, inverse_diagonal, raised, six_entries
+from torchstickcal.geometry.symmetric import DIAGONAL, IDENTITY, inverse_diagonal, raised
 from torchstickcal.losses.camera_point import CameraPointTerms, UnknownTerms
 from torchstickcal.model.objective import PRIOR, Objective
 from torchstickcal.model.state import State
@@ -267,13 +267,12 @@ class NormalEquations:
         hessian, gradient = m.by_frame(self.point_hessian), m.by_frame(self.point_gradient)
         for name, terms in self.objective.linearise_frames(self.state, self._exact).items():
             self.terms[name] = self.terms[name] + terms.cost
-            blocks, slopes = terms.hessian.to(hessian.dtype), terms.gradient.to(hessian.dtype)
             members = self.objective.groups[name].unbind(1)
-            for i, first in enumerate(members):
-                gradient.index_add_(-1, first, slopes[:, i])
-                hessian.index_add_(-1, first, six_entries(blocks[:, i, i].flatten(-2)).unflatten(-1, blocks.shape[-2:]))
-                for j, second in enumerate(members[i + 1 :], i + 1):
-                    within.add(first, second, blocks[:, i, j])
+            for number, points in enumerate(members):
+                gradient.index_add_(-1, points, terms.gradient[:, number].to(gradient.dtype))
+                hessian.index_add_(-1, points, terms.hessian[:, number].to(hessian.dtype))
+            for (first, second), blocks in zip(itertools.combinations(members, 2), terms.cross.unbind(1), strict=True):
+                within.add(first, second, blocks.to(hessian.dtype))
         return within
 
     def _add_track_losses(self) -> BetweenFrames | None:

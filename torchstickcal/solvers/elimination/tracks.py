@@ -79,7 +79,9 @@ def _inverse_factor(blocks: Tensor) -> Tensor:
     """Inverses of the Cholesky factors of the blocks (..., m, m); NaN for blocks that are not positive definite."""
     identity = torch.eye(blocks.shape[-1], dtype=blocks.dtype, device=blocks.device).expand_as(blocks)
     factor, failed = torch.linalg.cholesky_ex(blocks)
-    return torch.linalg.solve_triangular(factor, identity, upper=False).where(failed[..., None, None] == 0, torch.nan)
+    if bool(failed.any()):
+        factor = factor.where(failed[..., None, None] == 0, torch.nan)
+    return torch.linalg.solve_triangular(factor, identity, upper=False)
 
 
 class TrackElimination:
