@@ -1,17 +1,19 @@
 """What may be unknown of a camera beside its pose: one file per unknown, found by its name."""
 
 from torchstickcal.model.unknowns.base import (
-    REFINEMENTS,
     CameraUnknown,
     ClockUnknown,
     Columns,
     ImageMotion,
     InUnits,
     LensUnknown,
-    Refinement,
     RigEstimate,
     Sharing,
     View,
+)
+from torchstickcal.model.unknowns.registered import (
+    REFINEMENTS,
+    Refinement,
     all_unknowns,
     clock_refinements,
     register_unknown,

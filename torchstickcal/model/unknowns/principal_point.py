@@ -8,7 +8,8 @@ import torch
 from torch import Tensor
 
 from torchstickcal.geometry.cameras import Intrinsics
-from torchstickcal.model.unknowns.base import LensUnknown, Sharing, View, register_unknown
+from torchstickcal.model.unknowns.base import LensUnknown, Sharing, View
+from torchstickcal.model.unknowns.registered import register_unknown
 
 _PRIOR_FOCAL_LENGTHS = 0.02
 

@@ -5,7 +5,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from torchstickcal.model.unknowns.base import ClockUnknown, InUnits, RigEstimate, Sharing, register_unknown
+from torchstickcal.model.unknowns.base import ClockUnknown, InUnits, RigEstimate, Sharing
+from torchstickcal.model.unknowns.registered import register_unknown
 
 
 @register_unknown

@@ -11,7 +11,8 @@ from torch import Tensor
 
 from torchstickcal.errors import ConfigError
 from torchstickcal.geometry.cameras import Intrinsics, PixelMap
-from torchstickcal.model.unknowns.base import REFINEMENTS, CameraUnknown, ClockUnknown, ImageMotion, Sharing, View
+from torchstickcal.model.unknowns.base import CameraUnknown, ClockUnknown, ImageMotion, Sharing, View
+from torchstickcal.model.unknowns.registered import REFINEMENTS
 
 
 @dataclass(frozen=True)
