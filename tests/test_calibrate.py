@@ -58,7 +58,7 @@ def test_a_segment_never_seen_whole_sets_no_scale(noisy):
     observations, _ = noisy
     keypoints = observations.keypoints.clone()
     keypoints[:, :, observations.point_names.index("head_top")] = torch.nan
-    with pytest.raises(ObservationError, match="never reconstructed in the same frame"):
+    with pytest.raises(ObservationError, match="never seen in the same frame"):
         calibrate(dataclasses.replace(observations, keypoints=keypoints), "human_only")
 
 

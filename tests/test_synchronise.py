@@ -104,7 +104,7 @@ def numbered(cameras: int, frames: int) -> Observations:
 def test_frames_are_moved_to_the_nearest_common_frames():
     found = on_common_frames(numbered(3, 5), torch.tensor([0, 2.25, -3]))
     common = found.observations
-    assert (found.first, common.num_frames) == (0, 5)
+    assert found.numbers.tolist() == [0, 1, 2, 3, 4]
     frames = common.keypoints[:, :, 0, 1]
     nan = torch.nan
     expected = torch.tensor([[0, 1, 2, 3, 4], [nan, nan, 0, 1, 2], [3, 4, nan, nan, nan]]).double()

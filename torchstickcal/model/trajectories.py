@@ -18,6 +18,8 @@ from torch import Tensor
 
 _HALF_WIDTHS = (4, 8, 16)
 """Half widths of the windows, frames."""
+WINDOW_FRAMES = _HALF_WIDTHS[-1]
+"""Frames further apart than this do not influence each other's trajectories."""
 _DEGREES = 2 * _HALF_WIDTHS[0] + 1
 """K, number of polynomial coefficients."""
 _RIDGE = 1e-9

@@ -21,8 +21,8 @@ from torchstickcal.observations import Observations
 from torchstickcal.pipeline.focal_search import search_focal
 from torchstickcal.pipeline.initialise import initialise, triangulated
 from torchstickcal.pipeline.run import Run
-from torchstickcal.pipeline.scale import rulers
-from torchstickcal.pipeline.stage import StageResult, run_stage
+from torchstickcal.pipeline.scale import check_scale, rulers
+from torchstickcal.pipeline.stage import StageResult, agreeing_cameras, run_stage
 from torchstickcal.pipeline.synchronise import (
     CLOCK_STAGE,
     CommonFrames,
@@ -93,6 +93,11 @@ class Adjustment:
     def kept(self) -> Measurements:
         """The measurements that took part to the end."""
         return self.measurements.keeping(self.last.inliers)
+
+    @property
+    def agreeing_cameras(self) -> Tensor:
+        """(B, C), the cameras whose keypoints agree with those of the other cameras."""
+        return agreeing_cameras(self.measurements, self.kept)
 
     @property
     def asynchronous(self) -> bool:
@@ -187,7 +192,7 @@ def begin(
     began = time.perf_counter()
     config, frames = run.config, on_common_frames(observations, offsets_frames)
     seen = measured(frames, config)
-    rulers(seen, config)
+    check_scale(seen, rulers(seen, config))
     if start is not None:
         state = _state_of(start, seen, config)
     elif observations.intrinsics_known:

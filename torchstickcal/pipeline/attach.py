@@ -20,7 +20,8 @@ from torchstickcal.solvers.newton import polish
 def attach_gradients(ended: Adjustment, data: Measurements, run: Run, mode: GradientMode) -> State:
     """The state where the last stage ended, with gradients.
 
-    It depends on the measurements through the last stage that estimated cameras and through those after it.
+    It depends on the measurements through the last stage that estimated cameras and through those after it. Sessions in which
+    a stage has failed have no gradients.
 
     Args:
         ended: the sessions where their last stage ended.
@@ -34,8 +35,10 @@ def attach_gradients(ended: Adjustment, data: Measurements, run: Run, mode: Grad
         fixed = None if result.stage.cameras == "free" else state if number else result.minimum
         state = attach(Objective(kept, result.losses), _polished(kept, result, fixed), mode, fixed)
         if result.stage.rescale:
-            state = state.scaled(scale_factors(kept, state.points, rulers(kept, run.config)))
-    return state
+            factors, _ = scale_factors(kept, state.points, rulers(kept, run.config))
+            state = state.scaled(factors)
+    failed = torch.tensor([any(record.stop.failed for record in records) for records in ended.records])
+    return state.replaced(failed.to(state.points.device), ended.state)
 
 
 @torch.no_grad()

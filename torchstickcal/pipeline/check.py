@@ -15,6 +15,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from torchstickcal.geometry.singular import covariance_of, solve_information
 from torchstickcal.model.measurements import Measurements
 from torchstickcal.model.noise import residual_correlation
 from torchstickcal.model.state import State
@@ -104,15 +105,15 @@ class CameraCheck:
     def _decrease(self, names: tuple[str, ...]) -> float:
         chosen, _ = self._chosen(names)
         gradient = chosen.mT @ self._gradient
-        return float(gradient @ torch.linalg.solve(chosen.mT @ self._information @ chosen, gradient))
+        return float(gradient @ solve_information(chosen.mT @ self._information @ chosen, gradient))
 
     def _solved(self, names: tuple[str, ...]) -> tuple[RigUnknowns, Tensor, Tensor]:
         """A choice's unknowns, their values and their covariance."""
         chosen, unknowns = self._chosen(names)
-        covariance = torch.linalg.inv(chosen.mT @ self._information @ chosen)
+        information = chosen.mT @ self._information @ chosen
         poses = len(self._gradient) - self._every.count
-        values = -(covariance @ (chosen.mT @ self._gradient))[poses:]
-        return unknowns, values, covariance[poses:, poses:] / max(self._evidence, _LEAST_EVIDENCE)
+        values = -solve_information(information, chosen.mT @ self._gradient)[poses:]
+        return unknowns, values, covariance_of(information)[poses:, poses:] / max(self._evidence, _LEAST_EVIDENCE)
 
     def _chosen(self, names: tuple[str, ...]) -> tuple[Tensor, RigUnknowns]:
         """The map from poses and a choice's unknowns to poses and all unknowns, and the choice's unknowns."""

@@ -80,12 +80,15 @@ def _residuals(ended: Adjustment) -> Tensor:
 
 
 def _covariance(ended: Adjustment) -> Tensor:
-    """Covariance of the cameras' tangents and further unknowns where they were estimated last; NaN if they never were."""
+    """Covariance of the cameras' tangents and further unknowns where they were estimated last; NaN if they never were.
+
+    Nothing is known of a camera whose keypoints do not agree with those of the others.
+    """
     last, measurements = ended.last_camera_stage, ended.measurements
     if last.stage.cameras != "free":
         size = 6 * (measurements.num_cameras - 1) + measurements.unknowns.count
         return torch.full((size, size), torch.nan, dtype=torch.float64, device=measurements.pixels.device)
-    kept = measurements.keeping(last.inliers)
+    kept = measurements.keeping(last.inliers & ended.agreeing_cameras[..., None])
     return camera_covariance(likelihood(kept, last.losses, ended.last.sigma_px), last.state)[0]
 
 
@@ -133,5 +136,4 @@ def _times(frames: CommonFrames, first_readout_s: Tensor) -> Tensor | None:
     """(G,), when the common frames are."""
     if frames.rate_hz is None:
         return None
-    common = frames.first + torch.arange(frames.lags.shape[1]).to(first_readout_s)
-    return common / frames.rate_hz + first_readout_s / 2
+    return frames.numbers.to(first_readout_s) / frames.rate_hz + first_readout_s / 2

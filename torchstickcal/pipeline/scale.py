@@ -29,12 +29,14 @@ class Ruler:
     """(B,), one for each session"""
     rigid: bool
 
+    def known(self, measurements: Measurements) -> Tensor:
+        """(B, F), whether two cameras see each of its points."""
+        return measurements.by_frame(measurements.active)[..., [*self.start, *self.end]].all(-1)
+
     def measured_m(self, measurements: Measurements, points: Tensor) -> Tensor:
         """Its length in every frame (B, F), NaN where not all its points are known, of points (B, 3, N), metres."""
-        by_frame, active = measurements.by_frame(points), measurements.by_frame(measurements.active)
-        start, end = list(self.start), list(self.end)
-        vectors = by_frame[..., end].mean(-1) - by_frame[..., start].mean(-1)
-        known = active[..., start + end].all(-1)
+        by_frame, known = measurements.by_frame(points), self.known(measurements)
+        vectors = by_frame[..., list(self.end)].mean(-1) - by_frame[..., list(self.start)].mean(-1)
         return vectors.square().sum(1).where(known, 1.0).sqrt().where(known, torch.nan)
 
 
@@ -59,16 +61,30 @@ def rulers(measurements: Measurements, config: Config) -> list[Ruler]:
     )
 
 
-def scale_factors(measurements: Measurements, points: Tensor, known: Sequence[Ruler]) -> Tensor:
-    """Known over mean reconstructed length, (B,); frames in which a rigid ruler is an outlier are left out.
+def check_scale(measurements: Measurements, known: Sequence[Ruler]) -> None:
+    """Refuse sessions in which the rulers set no scale.
+
+    Raises:
+        ObservationError: if in some session there is no frame in which two cameras see each point of a ruler.
+    """
+    if not bool(torch.stack([ruler.known(measurements).any(1) for ruler in known]).any(0).all()):
+        raise ObservationError(
+            "the points whose distance sets the scale are never seen in the same frame",
+            where="scale",
+            got="no frame",
+            expected="a frame in which two cameras see each of them",
+        )
+
+
+def scale_factors(measurements: Measurements, points: Tensor, known: Sequence[Ruler]) -> tuple[Tensor, Tensor]:
+    """Known over mean reconstructed length, (B,), and whether it is reconstructed in any frame, (B,); the factor is 1 if not.
+
+    Frames in which a rigid ruler is an outlier are left out.
 
     Args:
         measurements: the sessions.
         points: (B, 3, N), up to scale.
         known: the rulers.
-
-    Raises:
-        ObservationError: if in some session there is no frame in which a ruler's points are all known.
     """
     measured, expected = points.new_zeros(measurements.sessions), points.new_zeros(measurements.sessions)
     for ruler in known:
@@ -80,11 +96,5 @@ def scale_factors(measurements: Measurements, points: Tensor, known: Sequence[Ru
             lengths = lengths.where(deviation <= limit, torch.nan)
         measured += lengths.nansum(1)
         expected += ruler.lengths_m * lengths.isfinite().sum(1)
-    if not bool((measured > 0).all()):
-        raise ObservationError(
-            "the points whose distance sets the scale are never reconstructed in the same frame",
-            where="scale",
-            got="no frame",
-            expected="a frame in which all its points are seen by two cameras",
-        )
-    return expected / measured
+    reconstructed = (measured > 0) & measured.isfinite()
+    return expected.where(reconstructed, 1.0) / measured.where(reconstructed, 1.0), reconstructed

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import torch
@@ -16,11 +17,14 @@ from torchstickcal.model.objective import Objective
 from torchstickcal.model.state import State
 from torchstickcal.pipeline.run import Run
 from torchstickcal.pipeline.scale import rulers, scale_factors
-from torchstickcal.solvers import StageRecord, Termination, solver
+from torchstickcal.solvers import StageRecord, Stop, Termination, solver
 from torchstickcal.solvers.elimination.normal_equations import NormalEquations
 
 _RESOLUTION = {torch.float64: 0.0, torch.float32: 1e-6}
 """Relative decrease of the cost that can be told from rounding."""
+_LEAST_AGREEING_SHARE = 0.15
+"""Share of a camera's keypoints that must agree with the other cameras. Sound cameras have more than 0.8, cameras that see
+another scene 0.3 to 0.4; by chance some always agree."""
 
 
 class StageResult(NamedTuple):
@@ -67,7 +71,7 @@ def run_stage(
         state: where it starts.
         run: what all steps share.
     """
-    began = time.perf_counter()
+    began, given = time.perf_counter(), measurements
     squared_residuals = measurements.squared_residuals(state)
     sigma_px = estimate_sigma_px(measurements, squared_residuals)
     if stage.reject_sigmas is not None:
@@ -85,13 +89,38 @@ def run_stage(
         listener=run.listener,
     )
     state = minimum = outcome.state
+    stops = _judged(outcome.stops, Stop.UNDETERMINED, ~_determined(given, measurements))
     if stage.rescale:
-        state = minimum.scaled(scale_factors(measurements, minimum.points, rulers(measurements, run.config)))
+        factors, reconstructed = scale_factors(measurements, minimum.points, rulers(measurements, run.config))
+        state = minimum.scaled(factors)
+        stops = _judged(stops, Stop.UNSCALED, ~reconstructed)
     seconds = time.perf_counter() - began
     run.took(name, seconds)
-    ended = zip(outcome.stops, outcome.iterations, strict=True)
+    ended = zip(stops, outcome.iterations, strict=True)
     records = tuple(StageRecord(name, stop, seconds, iterations) for stop, iterations in ended)
     return StageResult(stage, state, minimum, objective.losses, measurements.visible, sigma_px, records)
+
+
+def agreeing_cameras(given: Measurements, kept: Measurements) -> Tensor:
+    """The cameras (B, C) of whose keypoints more agree with the other cameras than chance explains.
+
+    Args:
+        given: all keypoints.
+        kept: those that agree with each other.
+    """
+    return kept.visible.sum(2) > _LEAST_AGREEING_SHARE * given.visible.sum(2)
+
+
+def _determined(given: Measurements, kept: Measurements) -> Tensor:
+    """Whether the keypoints that agree determine a session's cameras and points, (B,); arguments as above."""
+    measured = 2 * kept.visible.sum((1, 2)) + kept.stick_active.sum((1, 2))
+    unknown = 3 * kept.active.sum(1) + 6 * (kept.num_cameras - 1) + kept.unknowns.count
+    return (measured > unknown) & agreeing_cameras(given, kept).all(1)
+
+
+def _judged(stops: Sequence[Stop], verdict: Stop, applies: Tensor) -> tuple[Stop, ...]:
+    """Why each session stopped, with a verdict in place of convergence where it applies, (B,)."""
+    return tuple(verdict if stop.converged and bad else stop for stop, bad in zip(stops, applies.tolist(), strict=True))
 
 
 def _losses(stage: Stage, measurements: Measurements, state: State, sigma_px: Tensor) -> dict[str, Loss]:

@@ -2,17 +2,27 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Mapping
 
+import torch
+
+from torchstickcal.losses import ReprojectionLoss
+from torchstickcal.model.objective import Objective
 from torchstickcal.model.unknowns import CameraUnknown, all_unknowns
 from torchstickcal.observations import Observations
 from torchstickcal.pipeline.adjust import Adjustment
 from torchstickcal.pipeline.synchronise import ClockEstimate
 from torchstickcal.result import CameraParameter
+from torchstickcal.solvers.elimination.normal_equations import NormalEquations
 
 _USELESS_FOCAL_SHARE = 0.03
 _CONTRADICTED_SIGMAS = 4.0
 _OPEN_SHARE = 0.5
+_SAME_VIEW_RAD = 0.005
+"""Mean angle between the rays of two cameras to the same points, below which they see one and the same view."""
+_WRONG_LENGTH_SHARE, _WRONG_LENGTH_SIGMAS = 0.02, 4.0
+"""Deviation of a stick's length from the given one, as a share of it and in tolerances, beyond which it is not the stick."""
 
 
 def warnings_of(
@@ -26,7 +36,9 @@ def warnings_of(
         clocks: what a search for time offsets has found; None without one.
         unsynchronised: whether the motion contradicts the clocks, which were not estimated.
     """
-    found = _keypoints(ended)
+    found = _keypoints(ended) + _same_views(ended)
+    if len(ended.measurements.sticks) > 1:
+        found += _contradicted_lengths(ended)
     for name, unknown in all_unknowns().items():
         found += _contradicted(ended.observations[0], unknown, unknowns[name])
         found += _undetermined(ended, unknown, unknowns[name])
@@ -53,11 +65,54 @@ def _keypoints(ended: Adjustment) -> list[str]:
     if comparable > kept:
         share = (comparable - kept) / comparable
         found.append(f"{comparable - kept} of {comparable} keypoints ({share:.1%}) were rejected: they contradict the others.")
+    for camera in (~ended.agreeing_cameras[0]).nonzero().flatten().tolist():
+        own, agreeing = (int(m.visible[0, camera].sum()) for m in (measurements, ended.kept))
+        found.append(
+            f"{observations.camera_label(camera)}: {agreeing} of {own} keypoints agree with the other cameras, so that nothing "
+            "is known of where it is. Check that it shows the same athlete at the same time, and that its intrinsics are right."
+        )
     sigma_px = ended.last.sigma_px[0]
     noisy = (sigma_px > _USELESS_FOCAL_SHARE * measurements.cameras.focal_px.mean()).nonzero().flatten().tolist()
     if noisy:
         names = ", ".join(map(observations.point_label, noisy))
         found.append(f"The keypoints of these points are too noisy, and the points not reliable: {names}.")
+    return found
+
+
+def _same_views(ended: Adjustment) -> list[str]:
+    """Pairs of cameras that see the points from the same place."""
+    observations, measurements = ended.observations[0], ended.measurements
+    centres = -(ended.state.rotations[0].mT @ ended.state.translations[0][..., None])
+    rays = torch.nn.functional.normalize(ended.state.points - centres, dim=1)
+    found: list[str] = []
+    for first, second in itertools.combinations(range(measurements.num_cameras), 2):
+        common = measurements.visible[0, first] & measurements.visible[0, second]
+        angles = (rays[first] - rays[second])[:, common].square().sum(0).sqrt()
+        if len(angles) and float(angles.mean()) < _SAME_VIEW_RAD:
+            names = f"{observations.camera_label(first)} and {observations.camera_label(second)}"
+            found.append(
+                f"{names} see the scene from the same place, so that the pair has no depth. Check whether the same video was "
+                "taken for both."
+            )
+    return found
+
+
+def _contradicted_lengths(ended: Adjustment) -> list[str]:
+    """Sticks whose given lengths contradict each other: by the keypoints alone, they have others."""
+    observations, kept = ended.observations[0], ended.kept
+    reprojection = Objective(kept, {"reprojection": ReprojectionLoss(ended.last.sigma_px[:, None, None])})
+    step = NormalEquations(reprojection, ended.state, cameras_free=False).step()
+    lengths_m = kept.stick_lengths_m(ended.state.points + step.points)[0].nanmedian(0).values.tolist()
+    found: list[str] = []
+    for ends, given, sigma, length in zip(
+        kept.sticks.tolist(), kept.lengths_m[0].tolist(), kept.stick_sigma_m.tolist(), lengths_m, strict=True
+    ):
+        if abs(length - given) > max(_WRONG_LENGTH_SHARE * given, _WRONG_LENGTH_SIGMAS * sigma):
+            names = " - ".join(map(observations.point_label, ends))
+            found.append(
+                f"The stick {names} is {length:.4g} m long by the keypoints, but {given:.4g} m was given. Check the lengths of "
+                "all sticks, and which points are their ends."
+            )
     return found
 
 

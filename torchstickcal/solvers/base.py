@@ -19,11 +19,18 @@ class Stop(StrEnum):
     EXACT = "converged: the residuals are zero up to rounding errors"
     ITERATIONS = "stopped at the limit of iterations"
     DIVERGED = "stopped: no step lowers the cost"
+    UNDETERMINED = "stopped: too few keypoints agree with each other to determine the cameras"
+    UNSCALED = "stopped: no frame is left in which the points are known whose distance sets the scale"
 
     @property
     def converged(self) -> bool:
         """Whether the state is a minimum within the requested tolerance."""
         return self in {Stop.COST, Stop.CAMERAS, Stop.EXACT}
+
+    @property
+    def failed(self) -> bool:
+        """Whether the state means nothing, however often the solver is run again."""
+        return self in {Stop.UNDETERMINED, Stop.UNSCALED}
 
 
 @dataclass(frozen=True)

@@ -215,6 +215,7 @@ class _Minimum(torch.autograd.Function):
             differentiable = [leaf for leaf in leaves if leaf is not None and leaf.requires_grad]
             found = iter(torch.autograd.grad(-slope, differentiable, allow_unused=True))
         by_inputs = [next(found) if leaf is not None and leaf.requires_grad else None for leaf in leaves]
+        by_inputs = [None if v is None else _where_nonzero(adjoint, v) for v in by_inputs]
 
         # 3. Cameras that are held fixed are also passed through unchanged: add the incoming gradient.
         if not ctx.cameras_free:
@@ -262,6 +263,12 @@ def _tangent_gradient(rotations: Tensor, by_rotations: Tensor, by_translations: 
     skew = turned - turned.mT
     by_rotation = torch.stack([skew[..., 2, 1], skew[..., 0, 2], skew[..., 1, 0]], dim=-1)
     return torch.cat([(rotations.mT @ by_translations[..., None])[..., 0], by_rotation], dim=-1)
+
+
+def _where_nonzero(adjoint: Tangent, gradient: Tensor) -> Tensor:
+    """A gradient (B, ...), exactly zero for sessions whose adjoint is zero: 0 times infinity may have made it NaN there."""
+    nonzero = torch.stack([part.flatten(1).any(1) for part in adjoint]).any(0)
+    return gradient.where(nonzero.view(-1, *[1] * (gradient.ndim - 1)), 0.0)
 
 
 def _for_all_cameras(state: State, step: Tangent) -> Tangent:

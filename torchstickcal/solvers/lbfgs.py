@@ -26,12 +26,18 @@ _DAMPING = 1e-6
 
 
 class _PreconditionedState:
-    """The state of one session as a function of preconditioned unknowns, which are zero at the initial state."""
+    """The state of one session as a function of preconditioned unknowns, which are zero at the initial state.
 
-    def __init__(self, system: NormalEquations, start: State) -> None:
+    Args:
+        system: the normal equations at the initial state.
+        camera_factor: the upper triangular factor of the reduced camera system.
+        start: the initial state.
+    """
+
+    def __init__(self, system: NormalEquations, camera_factor: Tensor, start: State) -> None:
         hessian, no_pairs = raised(system.point_hessian, _DAMPING), system.objective.measurements.sticks[:0, 0]
         self._point_factor = PointElimination(hessian, no_pairs, no_pairs, None)
-        self._camera_factor = torch.linalg.cholesky(system.reduced[0]).mT
+        self._camera_factor = camera_factor
         self._point_response = system.point_response()[0].flatten(1).mT
         self._extrinsics = Extrinsics(start.rotations[0], start.translations[0])
         self._start, self._free_cameras = start, start.rotations.shape[1] - 1
@@ -102,8 +108,9 @@ def _solve_session(
             break
         if iteration == termination.max_iterations:
             break
-        moved = _run_round(objective, _PreconditionedState(system, state))
-        if not bool(moved.points.isfinite().all()):
+        factor, failed = torch.linalg.cholesky_ex(system.reduced[0])
+        moved = None if int(failed) else _run_round(objective, _PreconditionedState(system, factor.mT, state))
+        if moved is None or not bool(moved.points.isfinite().all()):
             stop = Stop.DIVERGED
             break
         step_m = float((moved.points - state.points).abs().max())
@@ -111,8 +118,12 @@ def _solve_session(
     return state, stop, tuple(records)
 
 
-def _run_round(objective: Objective, preconditioned: _PreconditionedState) -> State:
-    """The state after one run of LBFGS."""
+class _NotFiniteError(Exception):
+    """A cost that is not finite."""
+
+
+def _run_round(objective: Objective, preconditioned: _PreconditionedState) -> State | None:
+    """The state after one run of LBFGS; None if the line search fails."""
     optimiser = torch.optim.LBFGS(
         [preconditioned.cameras, preconditioned.points],
         max_iter=_ITERATIONS_PER_ROUND,
@@ -125,9 +136,14 @@ def _run_round(objective: Objective, preconditioned: _PreconditionedState) -> St
     def closure() -> Tensor:
         optimiser.zero_grad()
         cost = torch.stack(list(objective.terms(preconditioned.state()).values())).sum()
+        if not bool(cost.isfinite()):
+            raise _NotFiniteError
         cost.backward()
         return cost
 
-    optimiser.step(closure)  # pyright: ignore[reportArgumentType]
+    try:
+        optimiser.step(closure)  # pyright: ignore[reportArgumentType]
+    except (_NotFiniteError, IndexError):  # torch's line search has no bracket where every slope is zero up to rounding
+        return None
     with torch.no_grad():
         return preconditioned.state()

@@ -14,6 +14,7 @@ from torch import Tensor
 
 from torchstickcal.geometry import se3
 from torchstickcal.geometry.cameras import Intrinsics
+from torchstickcal.geometry.singular import covariance_of
 from torchstickcal.geometry.symmetric import backward, cholesky, forward
 from torchstickcal.losses import Loss, ReprojectionLoss, StickLengthLoss
 from torchstickcal.model.measurements import Measurements
@@ -23,8 +24,6 @@ from torchstickcal.solvers.elimination.cross_blocks import cross_rows
 from torchstickcal.solvers.elimination.normal_equations import NormalEquations
 
 _CHUNK_POINTS = 2000
-_SINGULAR = 1e-12
-"""Eigenvalue over the largest eigenvalue below which a direction counts as undetermined."""
 
 
 def likelihood(measurements: Measurements, losses: Mapping[str, Loss], sigma_px: Tensor) -> Objective:
@@ -49,18 +48,13 @@ def camera_covariance(objective: Objective, state: State) -> Tensor:
     """Covariance of the cameras, (B, 6 (C - 1) + K, 6 (C - 1) + K).
 
     Its rows are the tangents of all cameras but the first (translation in metres, rotation in radians), then the K lens and
-    clock unknowns. The variance along undetermined directions is set to zero, such as the scale without a stick.
+    clock unknowns. Along undetermined directions the variance is far beyond anything that is known.
 
     Args:
         objective: the likelihood, from :func:`likelihood`.
         state: the solution.
     """
-    information = NormalEquations(objective, state, cameras_free=True).reduced
-    scale = information.diagonal(dim1=1, dim2=2).clamp_min(1e-300).rsqrt()
-    values, vectors = torch.linalg.eigh(information * scale[:, :, None] * scale[:, None])
-    inverse = torch.where(values > _SINGULAR * values[:, -1:], values.reciprocal(), 0.0)
-    vectors = vectors * scale[..., None]
-    return (vectors * inverse[:, None]) @ vectors.mT
+    return covariance_of(NormalEquations(objective, state, cameras_free=True).reduced)
 
 
 def point_variances(measurements: Measurements, state: State, sigma_px: Tensor) -> Tensor:

@@ -12,12 +12,13 @@ from torch import Tensor
 
 from torchstickcal.benchmark.baselines.base import Estimate, Inputs, Listing, MissingInputError, baseline
 from torchstickcal.benchmark.baselines.frame_adjustment import FrameResiduals, adjust
+from torchstickcal.benchmark.baselines.joints import scaled_by_rulers
 from torchstickcal.config import InitialiseSettings
 from torchstickcal.losses import Huber, ReprojectionLoss
 from torchstickcal.model.measurements import Measurements
 from torchstickcal.observations import Observations
 from torchstickcal.pipeline.initialise import initialise
-from torchstickcal.pipeline.scale import Ruler, scale_factors
+from torchstickcal.pipeline.scale import Ruler
 
 MIDDLE = "stick_middle"
 _SIGMA_M = 0.001
@@ -46,7 +47,7 @@ def ewand(inputs: Inputs) -> Estimate:
     state = initialise(measurements, InitialiseSettings(), labels)
     lengths_m = measurements.lengths_m.unbind(1)
     known = [Ruler(s.ends[:1], s.ends[1:], length_m, True) for s, length_m in zip(observations.sticks, lengths_m, strict=True)]
-    state = state.scaled(scale_factors(measurements, state.points, known))
+    state = scaled_by_rulers(measurements, state, known)
     adjusted = adjust(measurements, state, ReprojectionLoss(kernel=Huber()), _wand(measurements, middle))
     status = "converged" if adjusted.converged else "the bundle adjustment stopped before it had converged"
     return Estimate.of_state(adjusted.state, status)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 from torch import Tensor
 
 from torchstickcal.benchmark.baselines.base import Inputs, required
@@ -9,7 +11,7 @@ from torchstickcal.model.measurements import Measurements
 from torchstickcal.model.state import State
 from torchstickcal.observations import Observations
 from torchstickcal.pipeline.initialise.triangulate import triangulate
-from torchstickcal.pipeline.scale import Ruler, scale_factors
+from torchstickcal.pipeline.scale import Ruler, check_scale, scale_factors
 
 _TRIANGULATION_RADIUS_PX = 40.0
 
@@ -50,7 +52,18 @@ def scaled_by_height(inputs: Inputs, measurements: Measurements, state: State) -
     top, *ankles = (inputs.observations.point_index(name) for name in ("head_top", "left_ankle", "right_ankle"))
     height_m = measurements.lengths_m.new_full((1,), required(inputs, "height_m"))
     ruler = Ruler((top,), tuple(ankles), height_m, rigid=False)
-    return state.scaled(scale_factors(measurements, state.points, [ruler]))
+    return scaled_by_rulers(measurements, state, [ruler])
+
+
+def scaled_by_rulers(measurements: Measurements, state: State, known: Sequence[Ruler]) -> State:
+    """The scene of one session scaled to known lengths.
+
+    Raises:
+        ObservationError: if there is no frame in which two cameras see each point of a ruler.
+    """
+    check_scale(measurements, known)
+    factors, _ = scale_factors(measurements, state.points, known)
+    return state.scaled(factors)
 
 
 def triangulated(measurements: Measurements, rotations: Tensor, translations: Tensor) -> State:

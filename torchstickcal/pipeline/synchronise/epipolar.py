@@ -62,8 +62,8 @@ class Tracks:
         moments, points = self._moments(first, second)
         usable = points >= _MIN_POINTS
         residual = torch.full_like(points, torch.nan)
-        matrices, _ = self._eigenvalue_problem(moments[usable], first, second)
-        residual[usable] = torch.linalg.eigvalsh(matrices)[:, 0].clamp_min(0.0)
+        matrices, _, regular = self._eigenvalue_problem(moments[usable], first, second)
+        residual[usable] = torch.linalg.eigvalsh(matrices)[:, 0].clamp_min(0.0).where(regular, torch.nan)
         return EpipolarFit(residual, self._motion(first, second) / points.clamp_min(1.0), points)
 
     def distances_px(self, first: int, second: int, lag: int) -> tuple[Tensor, slice, slice] | None:
@@ -71,13 +71,15 @@ class Tracks:
 
         Returns:
             The distances (n, P) in n pairs of frames, infinite for points that are not common, and the frames of both cameras.
-            None if there are too few common points.
+            None if there are too few common points, or if these are all the same.
         """
         at = lag - int(self.lags[0])
         moments, points = self._moments(first, second)
         if not 0 <= at < len(points) or points[at] < _MIN_POINTS:
             return None
-        matrices, back = self._eigenvalue_problem(moments[at : at + 1], first, second)
+        matrices, back, regular = self._eigenvalue_problem(moments[at : at + 1], first, second)
+        if not bool(regular):
+            return None
         vector = back[0] @ torch.linalg.eigh(matrices[0]).eigenvectors[:, 0]
         last = -(moments[at, 8, :8] @ vector) / moments[at, 8, 8]
         fundamental = torch.cat([vector, last[None]]).view(3, 3)
@@ -115,13 +117,14 @@ class Tracks:
         moments = sums[_PRODUCTS][:, :, _PRODUCTS].permute(4, 2, 0, 3, 1).reshape(-1, 9, 9)
         return moments, sums[_ONE, _ONE]
 
-    def _eigenvalue_problem(self, moments: Tensor, first: int, second: int) -> tuple[Tensor, Tensor]:
+    def _eigenvalue_problem(self, moments: Tensor, first: int, second: int) -> tuple[Tensor, Tensor, Tensor]:
         """Taubin's problem ``M f = lambda G f`` as a standard symmetric eigenvalue problem.
 
         M has the moments, G the squared gradients of ``b' F a``. The last entry of f, which has no gradient, is eliminated.
 
         Returns:
-            Symmetric matrices (L, 8, 8), and the matrices (L, 8, 8) from their eigenvectors to the first 8 entries of F.
+            Symmetric matrices (L, 8, 8), the matrices (L, 8, 8) from their eigenvectors to the first 8 entries of F, and
+            whether the problem is regular (L,). The matrices are zero where it is not, as for a point that never moves.
         """
         blocks = moments.view(-1, 3, 3, 3, 3)
         of_first, of_second = blocks[:, 2, :, 2, :], blocks[:, :, 2, :, 2]
@@ -129,10 +132,13 @@ class Tracks:
         gradient = gradient + torch.einsum("luv,rs->lurvs", of_second, _GRADIENT) / self._variance_px2[first]
         gradient = gradient.reshape(-1, 9, 9)[:, :8, :8]
         ridge = _EPSILON * gradient.diagonal(dim1=1, dim2=2).sum(1) + 1e-300
-        factor = torch.linalg.cholesky(gradient + ridge[:, None, None] * torch.eye(8, dtype=moments.dtype))
+        identity = torch.eye(8, dtype=moments.dtype)
+        factor, failed = torch.linalg.cholesky_ex(gradient + ridge[:, None, None] * identity)
         schur = moments[:, :8, :8] - moments[:, :8, 8:] @ moments[:, 8:, :8] / moments[:, 8:, 8:]
-        inverse = torch.linalg.inv(factor)
-        return inverse @ schur @ inverse.mT, inverse.mT
+        inverse = torch.linalg.solve_triangular(factor, identity.expand_as(factor), upper=False)
+        matrices = inverse @ schur @ inverse.mT
+        regular = (failed == 0) & matrices.isfinite().all(-1).all(-1)
+        return matrices.where(regular[:, None, None], 0.0), inverse.mT, regular
 
     def _motion(self, first: int, second: int) -> Tensor:
         """Sum of the squared distances of the common points from their mean positions, (L,), in the camera with less motion."""

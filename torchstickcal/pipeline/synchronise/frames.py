@@ -8,15 +8,20 @@ import torch
 from torch import Tensor
 
 from torchstickcal.errors import ObservationError
+from torchstickcal.model.trajectories import WINDOW_FRAMES
 from torchstickcal.observations import Observations
+
+_FURTHEST_FRAME = 1e12
+_LONGEST_PAUSE_FRAMES = WINDOW_FRAMES
+"""Frames without keypoints beyond which the frames on both sides have nothing to do with each other."""
 
 
 @dataclass(frozen=True, eq=False)
 class CommonFrames:
     """A session in which frame g of all cameras was exposed at about the same time.
 
-    Common frame g is at time g on the clock of camera 0, in frames. Of all common frames, G are kept: from the first to the
-    last that at least two cameras have.
+    Frame n of the session is at time n on the clock of camera 0, in frames. G of these are the common frames: from the first to
+    the last that at least two cameras have, without the middle of long pauses in which no camera has a frame.
     """
 
     observations: Observations
@@ -27,8 +32,8 @@ class CommonFrames:
     """(C, G), float64, time from a common frame to the start of the camera's frame, in frames; 0 where it has no frame"""
     offsets_frames: Tensor
     """(C,), float64, time offsets that were added to the cameras' timestamps or frame numbers, in frames"""
-    first: int
-    """number of the first common frame that is kept"""
+    numbers: Tensor
+    """(G,), int64, the frame of the session that each common frame is"""
     rate_hz: float | None
     """common frames per second; None if unknown"""
 
@@ -60,6 +65,7 @@ def on_common_frames(observations: Observations, offsets_frames: Tensor | None =
     offsets = starts.new_zeros(len(starts)) if offsets_frames is None else offsets_frames.to(starts)
     starts = starts + offsets[:, None]
     exists = starts.isfinite()
+    _check_resolution(starts, observations)
     nearest = (starts.nan_to_num() + 0.5).floor().long()
     firsts = torch.where(exists, nearest, torch.iinfo(torch.long).max).amin(1).sort().values
     lasts = torch.where(exists, nearest, torch.iinfo(torch.long).min).amax(1).sort().values
@@ -73,11 +79,12 @@ def on_common_frames(observations: Observations, offsets_frames: Tensor | None =
             remedy="Check that the times of all cameras count from about the same moment.",
         )
     lags = starts.nan_to_num() - nearest
-    index = torch.where(exists & (nearest >= first) & (nearest <= last), nearest - first, -1)
-    index = _without_duplicates(index, lags, last - first + 1)
+    within = exists & (nearest >= first) & (nearest <= last)
+    numbers, places = _without_pauses(nearest.where(within, first))
+    index = _without_duplicates(places.where(within, -1), lags, len(numbers))
     if _is_identity(index):
-        return CommonFrames(observations, index, lags, offsets, first, rate)
-    to_common = _ToCommonFrames(index, last - first + 1)
+        return CommonFrames(observations, index, lags, offsets, numbers, rate)
+    to_common = _ToCommonFrames(index, len(numbers))
     confidence = observations.confidence
     on_common = replace(
         observations,
@@ -86,7 +93,7 @@ def on_common_frames(observations: Observations, offsets_frames: Tensor | None =
         timestamps=None,
         fps=rate,
     )
-    return CommonFrames(on_common, index, to_common(lags, 0.0), offsets, first, rate)
+    return CommonFrames(on_common, index, to_common(lags, 0.0), offsets, numbers, rate)
 
 
 def _frame_starts(observations: Observations) -> tuple[float | None, Tensor]:
@@ -97,6 +104,35 @@ def _frame_starts(observations: Observations) -> tuple[float | None, Tensor]:
         return observations.fps, frames.expand(observations.num_cameras, -1)
     rate = observations.fps or float(max(1 / camera[camera.isfinite()].diff().median() for camera in times.double()))
     return rate, times.double() * rate
+
+
+def _check_resolution(starts: Tensor, observations: Observations) -> None:
+    """Refuse times so far from zero, in frames, that a float64 cannot tell a frame from the next.
+
+    Raises:
+        ObservationError: if there is such a time.
+    """
+    furthest = float(starts.nan_to_num(posinf=torch.inf).abs().max())
+    if furthest > _FURTHEST_FRAME:
+        raise ObservationError(
+            "times too far from zero to tell one frame from the next",
+            where="timestamps" if observations.timestamps is not None else "offsets_frames",
+            got=f"{furthest:.3g} frames from zero",
+            expected=f"at most {_FURTHEST_FRAME:.0g} frames",
+            remedy="Give timestamps in seconds, from about the beginning of the recording, and fps in frames per second.",
+        )
+
+
+def _without_pauses(nearest: Tensor) -> tuple[Tensor, Tensor]:
+    """The common frames of frame numbers (C, F): their numbers (G,), and the place of each given one among them, (C, F).
+
+    A pause is shortened to the number of frames over which nothing acts, so that a session costs what its frames cost.
+    """
+    taken = nearest.unique()
+    places = torch.cat([taken.new_zeros(1), taken.diff().clamp_max(_LONGEST_PAUSE_FRAMES + 1).cumsum(0)])
+    kept = torch.arange(int(places[-1]) + 1, device=nearest.device)
+    before = torch.searchsorted(places, kept, right=True) - 1
+    return taken[before] + kept - places[before], places[torch.searchsorted(taken, nearest)]
 
 
 def _is_identity(index: Tensor) -> bool:

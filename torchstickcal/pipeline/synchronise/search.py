@@ -15,6 +15,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import pad
 
+from torchstickcal.geometry.singular import solve_information
 from torchstickcal.model.measurements import Measurements
 from torchstickcal.model.trajectories import shifted_in_time
 from torchstickcal.pipeline.synchronise.epipolar import EpipolarFit, Tracks
@@ -70,7 +71,7 @@ def search_offsets(measurements: Measurements, max_offset_frames: float, noise_p
         max_offset_frames: largest time offset from camera 0, positive or negative.
         noise_px: approximate standard deviation of the keypoints.
     """
-    max_offset = min(int(max_offset_frames) + 1, measurements.frames - 1)
+    max_offset = int(min(max_offset_frames + 1, measurements.frames - 1))
     pixels, weights = _image_tracks(measurements, max_offset, noise_px)
     tracks = Tracks(pixels, weights, min(2 * max_offset, pixels.shape[2] - 1))
     fits, scores, offsets = _search(tracks, max_offset, noise_px)
@@ -88,7 +89,7 @@ def unsynchronised(measurements: Measurements, max_offset_frames: float, noise_p
 
     It is much faster than :func:`search_offsets`, which has the same arguments.
     """
-    max_offset = min(int(max_offset_frames) + 1, measurements.frames - 1)
+    max_offset = int(min(max_offset_frames + 1, measurements.frames - 1))
     pixels, weights = _image_tracks(measurements, max_offset, noise_px)
     tracks = Tracks(pixels, weights, min(max_offset, pixels.shape[2] - 1))
     near_zero, zero = tracks.lags.abs() <= 1, tracks.lags == 0
@@ -265,7 +266,7 @@ def _subframe_offsets(fits: Fits, offsets: Tensor, determined: tuple[bool, ...])
         robust = weights / (1 + ((target - design @ refined[1:]) / _PAIR_SCALE_FRAMES).square())
         ridge = _RIDGE * weights.max() * torch.eye(len(whole), dtype=torch.float64)
         normal = design.mT @ (robust[:, None] * design) + ridge
-        step = torch.linalg.solve(normal, design.mT @ (robust * (target - design @ whole)))
+        step = solve_information(normal, design.mT @ (robust * (target - design @ whole)))
         refined = torch.cat([refined[:1], whole + step])
     return refined
 
