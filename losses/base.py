@@ -11,6 +11,8 @@ Only the residuals have to be written. The scalar for training loops and LBFGS, 
 slope for exact gradients follow from them by automatic differentiation. A loss that is worth it overrides ``linearise`` and
 ``slope`` with closed forms. Leading dimensions before those named stand for sessions: scalars sum over them, linearised forms
 keep them.
+
+The losses compute in float32 at least, in the highest precision of what they are given, whether or not in an autocast region.
 """
 
 from __future__ import annotations
@@ -22,6 +24,7 @@ import torch
 from torch import Tensor, nn
 from torch.autograd import forward_ad
 
+from torchstickcal.arrays import tensor_of
 from torchstickcal.errors import ConfigError
 from torchstickcal.losses.robust import Quadratic, RobustKernel
 
@@ -40,7 +43,7 @@ class Loss(nn.Module):
 
     def __init__(self, sigma: float | Tensor = 1.0, weight: float = 1.0, kernel: RobustKernel | None = None) -> None:
         super().__init__()
-        self.register_buffer("sigma", torch.as_tensor(sigma, dtype=torch.float64))
+        self.register_buffer("sigma", tensor_of(sigma, "sigma", keep_graph=True).double())
         self.weight = weight
         self.kernel = kernel if kernel is not None else Quadratic()
 

@@ -2,6 +2,11 @@
 
 from __future__ import annotations
 
+import pickle
+from typing import Any
+
+_LONGEST_TEXT = 500
+
 
 class CalibrationError(ValueError):
     """Base class of all errors that torchstickcal raises on purpose.
@@ -12,6 +17,8 @@ class CalibrationError(ValueError):
         got: the given value or shape.
         expected: what would be accepted.
         remedy: how to fix the problem, one or more sentences.
+
+    It can be copied and sent to other processes with all of these; ``got`` arrives as a text if it cannot be sent itself.
 
     Example:
         >>> import torch
@@ -26,8 +33,12 @@ class CalibrationError(ValueError):
 
     def __init__(self, what: str, *, where: str, got: object, expected: str, remedy: str = "") -> None:
         self.what, self.where, self.got, self.expected, self.remedy = what, where, got, expected, remedy
-        message = f"{what} ({where}): got {got}; expected {expected}."
+        message = f"{what} ({where}): got {_text(got)}; expected {expected}."
         super().__init__(f"{message} {remedy}" if remedy else message)
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        state = {name: value if _can_be_sent(value) else _text(value) for name, value in self.__dict__.items()}
+        return _restored, (type(self), self.args, state)
 
 
 class ObservationError(CalibrationError):
@@ -44,3 +55,31 @@ class ConfigError(CalibrationError):
 
 class FileFormatError(CalibrationError):
     """A file that is damaged, unsafe, or not in the expected format."""
+
+
+class ObservationWarning(UserWarning):
+    """Observations that can be used, but probably do not mean what they say."""
+
+
+def _restored(kind: type[CalibrationError], arguments: tuple[Any, ...], state: dict[str, Any]) -> CalibrationError:
+    """An error as it was before it was copied or sent."""
+    error = kind.__new__(kind, *arguments)
+    error.__dict__.update(state)
+    return error
+
+
+def _can_be_sent(value: object) -> bool:
+    try:
+        pickle.loads(pickle.dumps(value))
+    except Exception:  # whatever the value itself raises
+        return False
+    return True
+
+
+def _text(value: object) -> str:
+    """A value as a text of bounded length."""
+    try:
+        text = str(value)
+    except Exception:  # such as for an integer of more than 4300 digits
+        text = f"a value of type {type(value).__name__} that cannot be shown"
+    return text if len(text) <= _LONGEST_TEXT else f"{text[:_LONGEST_TEXT]}..."

@@ -20,7 +20,7 @@ from torchstickcal.errors import ObservationError
 if TYPE_CHECKING:
     from kornia.geometry.camera import PinholeCamera
 
-_MAX_INVERSE_DEPTH = 1e6
+_MIN_DEPTH = 1e-6
 _FOLD_SEARCH_RADIUS = 8.0
 _FOLD_SEARCH_STEPS = 4096
 _UNDISTORT_ITERATIONS = 50
@@ -385,7 +385,12 @@ class Intrinsics:
 
 def inverse_depths(depth: Tensor) -> Tensor:
     """1 / z, bounded where z is nearly 0."""
-    return depth.reciprocal().clamp(-_MAX_INVERSE_DEPTH, _MAX_INVERSE_DEPTH)
+    return away_from_zero(depth).reciprocal()
+
+
+def away_from_zero(depth: Tensor) -> Tensor:
+    """Depths, those nearly 0 moved to the least by which one can divide, with gradient 0."""
+    return depth.abs().clamp_min(_MIN_DEPTH).copysign(depth)
 
 
 def _broadcast(per_camera: Tensor, ndim: int) -> Tensor:
