@@ -132,8 +132,8 @@ def truth_of(value: Any, where: str) -> bool:
     return bool(plain)
 
 
-def names_of(value: Any, where: str, count: int) -> tuple[str, ...] | None:
-    """So many different names, in order; None for none.
+def names_of(value: Any, where: str, count: int | None = None) -> tuple[str, ...] | None:
+    """Different names, in order, and so many where their number is known; None for none.
 
     Raises:
         ObservationError: if they are not.
@@ -142,9 +142,9 @@ def names_of(value: Any, where: str, count: int) -> tuple[str, ...] | None:
         return None
     given = items_of(value)
     names = tuple(map(name_of, given or ()))
-    if len(names) != count or len(set(names)) != count:
-        got = _shown(value) if given is None else names
-        raise ObservationError("names do not fit the keypoints", where=where, got=got, expected=f"{count} different names")
+    if given is None or len(names) != (len(names) if count is None else count) or len(set(names)) != len(names):
+        got, number = _shown(value) if given is None else names, "" if count is None else f"{count} "
+        raise ObservationError("names do not fit the keypoints", where=where, got=got, expected=f"{number}different names")
     return names
 
 

@@ -16,6 +16,7 @@ from torchstickcal.geometry.cameras import Intrinsics
 from torchstickcal.stick import Stick, check_ends, located_sticks, point_index
 
 _COEFFICIENTS = (4, 5, 8, 12, 14)
+_FISHEYE_COEFFICIENTS = (4,)
 _LARGEST_INTRINSIC = 1e9
 """Beyond any camera; squares of larger numbers may not be numbers at all."""
 
@@ -109,11 +110,9 @@ class Observations:
         put(self, "intrinsics_known", truth_of(intrinsics_known, "intrinsics_known") and intrinsics is not None)
         matrix = _guess(self.image_size) if intrinsics is None else tensor_of(intrinsics, "intrinsics", device=device)
         put(self, "intrinsics", matrix[0] if matrix.shape == (1, 3, 3) else matrix)
-        put(
-            self,
-            "distortion",
-            None if distortion is None else _coefficients(tensor_of(distortion, "distortion", device=device)),
-        )
+        if distortion is not None:
+            distortion = coefficients_of(tensor_of(distortion, "distortion", device=device), self.fisheye)
+        put(self, "distortion", distortion)
         self._check_intrinsics()
         if confidence is not None:
             confidence = tensor_of(confidence, "confidence", device=device, masked=0.0)
@@ -246,15 +245,10 @@ class Observations:
                     expected="[[fx, s, cx], [0, fy, cy], [0, 0, 1]] with fx, fy > 0, in pixels",
                 )
         if self.distortion is not None:
-            counts = (4,) if self.fisheye else _COEFFICIENTS
             shape = tuple(self.distortion.shape)
-            if shape[-1:] not in {(n,) for n in counts} or shape[:-1] not in {(), (cameras,)}:
-                raise ObservationError(
-                    "distortion has the wrong shape",
-                    where="distortion",
-                    got=shape,
-                    expected=f"({cameras}, D) or (D,), D of {', '.join(map(str, counts))}",
-                )
+            if shape[:-1] not in {(), (cameras,)}:
+                expected = f"({cameras}, D) or (D,)"
+                raise ObservationError("distortion has the wrong shape", where="distortion", got=shape, expected=expected)
             if not (self.distortion.abs() <= _LARGEST_INTRINSIC).all():
                 raise ObservationError(
                     "distortion is not finite",
@@ -345,15 +339,26 @@ class Observations:
                 )
 
 
-def _coefficients(distortion: Tensor) -> Tensor | None:
-    """Distortion as (D,) or (C, D), where rows or columns of OpenCV's were given; None for no coefficients."""
-    if distortion.ndim > 1 and distortion.shape[-1] == 1:
+def coefficients_of(distortion: Tensor, fisheye: bool) -> Tensor | None:
+    """Lens coefficients (..., D), where rows or columns of OpenCV's were given; None for no coefficients.
+
+    Raises:
+        ObservationError: if their number is none of OpenCV's.
+    """
+    counts = _FISHEYE_COEFFICIENTS if fisheye else _COEFFICIENTS
+    given = tuple(distortion.shape)
+    if distortion.ndim > 1 and given[-1] == 1:
         distortion = distortion[..., 0]
     if distortion.ndim == 3 and distortion.shape[1] == 1:
         distortion = distortion[:, 0]
     if distortion.ndim == 2 and len(distortion) == 1:
         distortion = distortion[0]
-    return distortion if distortion.numel() else None
+    if distortion.shape[-1:] == (0,):
+        return None
+    if distortion.shape[-1:] not in {(n,) for n in counts}:
+        expected = f"(cameras, D) or (D,), D of {', '.join(map(str, counts))}"
+        raise ObservationError("distortion has the wrong shape", where="distortion", got=given, expected=expected)
+    return distortion
 
 
 def _without_zeros(distortion: Tensor) -> Tensor:

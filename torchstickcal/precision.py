@@ -28,7 +28,7 @@ def in_common_precision(*tensors: Tensor) -> tuple[Tensor, ...]:
     return tuple(tensor.to(dtype) for tensor in wide)
 
 
-def full_precision(device: torch.device) -> AbstractContextManager[None]:
+def full_precision(device: torch.device) -> AbstractContextManager[object]:
     """A region without autocast: half precision would spoil poses and residuals, in which large numbers nearly cancel."""
     if not torch.amp.is_autocast_available(device.type):
         return nullcontext()

@@ -26,7 +26,7 @@ def warnings_of(
         clocks: what a search for time offsets has found; None without one.
         unsynchronised: whether the motion contradicts the clocks, which were not estimated.
     """
-    found = _keypoints(ended)
+    found = [*ended.observations[0].warnings, *_keypoints(ended)]
     for name, unknown in all_unknowns().items():
         found += _contradicted(ended.observations[0], unknown, unknowns[name])
         found += _undetermined(ended, unknown, unknowns[name])
