@@ -11,13 +11,14 @@ import torch
 from torch import Tensor
 from torch.masked import MaskedTensor
 
-from torchstickcal.errors import CalibrationError, ObservationError
+from torchstickcal.errors import CalibrationError, ObservationError, shown
 from torchstickcal.precision import at_least_float32
 
 FARTHEST_PX = 1e7
 """What lies farther than this from the corner of an image, in pixels, is no keypoint: no image is as large."""
 
 _INTEGERS = {torch.uint8, torch.uint16, torch.uint32, torch.uint64, torch.int8, torch.int16, torch.int32, torch.int64}
+_LARGEST_INDEX = 2**31
 _KINDS = {
     "b": "truth values",
     "c": "complex numbers",
@@ -105,19 +106,15 @@ def number_of(
     if number is not None and least <= number <= most:
         return number
     is_array = isinstance(value, list | tuple | set | dict) or getattr(value, "ndim", 0) > 0
-    raise error(what, where=where, got=_shown(value), expected=expected, remedy=several if is_array else "")
+    raise error(what, where=where, got=shown(value, quoted=True), expected=expected, remedy=several if is_array else "")
 
 
 def index_of(value: Any) -> int | None:
     """A whole number, of Python or numpy or a tensor without dimensions, as Python's own; None if it is none."""
     number = _plain(value)
-    if (
-        isinstance(number, bool)
-        or not isinstance(number, numbers.Real)
-        or (isinstance(number, float) and not number.is_integer())
-    ):
+    if isinstance(number, bool) or not isinstance(number, int | float) or not abs(number) <= _LARGEST_INDEX:
         return None
-    return int(number) if isinstance(number, int | float) else None
+    return int(number) if number == int(number) else None
 
 
 def truth_of(value: Any, where: str) -> bool:
@@ -128,7 +125,7 @@ def truth_of(value: Any, where: str) -> bool:
     """
     plain = _plain(value)
     if not isinstance(plain, bool | int) or plain not in (0, 1):
-        raise ObservationError("neither yes nor no", where=where, got=_shown(value), expected="True or False")
+        raise ObservationError("neither yes nor no", where=where, got=shown(value, quoted=True), expected="True or False")
     return bool(plain)
 
 
@@ -141,9 +138,10 @@ def names_of(value: Any, where: str, count: int | None = None) -> tuple[str, ...
     if value is None:
         return None
     given = items_of(value)
-    names = tuple(map(name_of, given or ()))
-    if given is None or len(names) != (len(names) if count is None else count) or len(set(names)) != len(names):
-        got, number = _shown(value) if given is None else names, "" if count is None else f"{count} "
+    are_names = given is not None and all(isinstance(name, str) or index_of(name) is not None for name in given)
+    names = tuple(map(name_of, given or ())) if are_names else ()
+    if not are_names or len(names) != (len(names) if count is None else count) or len(set(names)) != len(names):
+        got, number = names if are_names else shown(value, quoted=True), "" if count is None else f"{count} "
         raise ObservationError("names do not fit the keypoints", where=where, got=got, expected=f"{number}different names")
     return names
 
@@ -154,7 +152,7 @@ def items_of(value: Any) -> list[Any] | None:
         return None
     try:
         return list(value)
-    except TypeError:
+    except Exception:  # what another library raises for its own objects cannot be foreseen
         return None
 
 
@@ -208,7 +206,7 @@ def _from_tensor(tensor: Tensor, where: str) -> Tensor:
     if tensor.is_meta:
         raise _refused(where, "a tensor on the meta device, which has no values")
     if not (tensor.is_floating_point() or tensor.dtype in _INTEGERS):
-        raise _refused(where, f"a tensor of {tensor.dtype}")
+        raise _refused(where, f"a tensor of {tensor.dtype}", remedy="Convert it to real numbers, as with .double().")
     return at_least_float32(tensor.resolve_neg())
 
 
@@ -251,8 +249,3 @@ def _number(value: Any) -> float | None:
     except (OverflowError, ValueError, TypeError):
         return None
     return number if math.isfinite(number) else None
-
-
-def _shown(value: Any) -> Any:
-    """A value as an error shows it: a text in quotation marks."""
-    return repr(value) if isinstance(value, str) else value

@@ -8,6 +8,15 @@ from typing import Any
 _LONGEST_TEXT = 500
 
 
+def shown(value: object, quoted: bool = False) -> str:
+    """A value as a text of bounded length, whatever it is; in quotation marks if it is itself a text and shall have them."""
+    try:
+        text = repr(value) if quoted and isinstance(value, str) else str(value)
+    except Exception:  # such as for an integer of more than 4300 digits
+        text = f"a value of type {type(value).__name__} that cannot be shown"
+    return text if len(text) <= _LONGEST_TEXT else f"{text[:_LONGEST_TEXT]}..."
+
+
 class CalibrationError(ValueError):
     """Base class of all errors that torchstickcal raises on purpose.
 
@@ -33,11 +42,11 @@ class CalibrationError(ValueError):
 
     def __init__(self, what: str, *, where: str, got: object, expected: str, remedy: str = "") -> None:
         self.what, self.where, self.got, self.expected, self.remedy = what, where, got, expected, remedy
-        message = f"{what} ({where}): got {_text(got)}; expected {expected}."
+        message = f"{what} ({where}): got {shown(got)}; expected {expected}."
         super().__init__(f"{message} {remedy}" if remedy else message)
 
     def __reduce__(self) -> tuple[Any, ...]:
-        state = {name: value if _can_be_sent(value) else _text(value) for name, value in self.__dict__.items()}
+        state = {name: value if _can_be_sent(value) else shown(value) for name, value in self.__dict__.items()}
         return _restored, (type(self), self.args, state)
 
 
@@ -74,12 +83,3 @@ def _can_be_sent(value: object) -> bool:
     except Exception:  # whatever the value itself raises
         return False
     return True
-
-
-def _text(value: object) -> str:
-    """A value as a text of bounded length."""
-    try:
-        text = str(value)
-    except Exception:  # such as for an integer of more than 4300 digits
-        text = f"a value of type {type(value).__name__} that cannot be shown"
-    return text if len(text) <= _LONGEST_TEXT else f"{text[:_LONGEST_TEXT]}..."
