@@ -28,6 +28,8 @@ from torchstickcal.arrays import tensor_of
 from torchstickcal.errors import ConfigError
 from torchstickcal.losses.robust import Quadratic, RobustKernel
 
+_LEAST_SIGMA = 1e-9
+
 
 class Loss(nn.Module):
     """A sum of robust squared residuals in units of their standard deviation.
@@ -37,6 +39,10 @@ class Loss(nn.Module):
             differs between sessions, a tensor that broadcasts against the squared residuals.
         weight: factor on the whole loss (the paper's lambda).
         kernel: robust kernel on squared whitened residuals; None for least squares.
+
+    Raises:
+        ConfigError: if ``sigma`` is a number that is no standard deviation.
+        ObservationError: if it is neither a number nor an array of numbers.
     """
 
     sigma: Tensor
@@ -44,6 +50,9 @@ class Loss(nn.Module):
     def __init__(self, sigma: float | Tensor = 1.0, weight: float = 1.0, kernel: RobustKernel | None = None) -> None:
         super().__init__()
         self.register_buffer("sigma", tensor_of(sigma, "sigma", keep_graph=True).double())
+        if not isinstance(sigma, Tensor) and not bool((self.sigma >= _LEAST_SIGMA).all()):
+            expected = f"{_LEAST_SIGMA:g} or more"
+            raise ConfigError("not a standard deviation", where=f"{type(self).__name__}.sigma", got=sigma, expected=expected)
         self.weight = weight
         self.kernel = kernel if kernel is not None else Quadratic()
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import pickle
-from typing import Any
+from typing import Any, Self, SupportsIndex
 
 _LONGEST_TEXT = 500
 
@@ -45,9 +45,12 @@ class CalibrationError(ValueError):
         message = f"{what} ({where}): got {shown(got)}; expected {expected}."
         super().__init__(f"{message} {remedy}" if remedy else message)
 
-    def __reduce__(self) -> tuple[Any, ...]:
-        state = {name: value if _can_be_sent(value) else shown(value) for name, value in self.__dict__.items()}
+    def __reduce_ex__(self, protocol: SupportsIndex) -> tuple[Any, ...]:
+        state = {name: value if _can_be_sent(value, protocol) else shown(value) for name, value in self.__dict__.items()}
         return _restored, (type(self), self.args, state)
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> Self:
+        return pickle.loads(pickle.dumps(self))
 
 
 class ObservationError(CalibrationError):
@@ -77,9 +80,9 @@ def _restored(kind: type[CalibrationError], arguments: tuple[Any, ...], state: d
     return error
 
 
-def _can_be_sent(value: object) -> bool:
+def _can_be_sent(value: object, protocol: SupportsIndex) -> bool:
     try:
-        pickle.loads(pickle.dumps(value))
+        pickle.loads(pickle.dumps(value, int(protocol)))
     except Exception:  # whatever the value itself raises
         return False
     return True

@@ -51,8 +51,8 @@ def project(points_cam: Tensor, cameras: Intrinsics) -> Tensor:
 
 def _limited(normalised: Tensor) -> Tensor:
     """Normalised coordinates (..., 2), drawn in towards the axis where they are farther from it than any lens sees."""
-    squared = normalised.square().sum(-1, keepdim=True)
-    return normalised * (_WIDEST**2 / squared.clamp_min(_WIDEST**2)).sqrt()
+    excess = normalised.square().sum(-1, keepdim=True) / _WIDEST**2
+    return normalised * excess.clamp_min(1.0).rsqrt()
 
 
 def _with_skew(pixels: Tensor, matrix: Tensor) -> Tensor:
