@@ -12,8 +12,8 @@ from torch import Tensor
 from torchstickcal.geometry.cameras import Intrinsics, away_from_zero
 
 _WIDEST = 20.0
-"""Distance from the axis, in normalised coordinates, beyond which no lens of OpenCV's standard model sees anything: its powers
-would leave float32."""
+"""Distance from the axis, in normalised coordinates, up to which the powers of OpenCV's standard lens model fit into
+float32. No lens sees as far."""
 
 
 def to_cameras(points: Tensor, rotations: Tensor, translations: Tensor) -> Tensor:
@@ -50,7 +50,9 @@ def project(points_cam: Tensor, cameras: Intrinsics) -> Tensor:
 
 
 def _limited(normalised: Tensor) -> Tensor:
-    """Normalised coordinates (..., 2), drawn in towards the axis where they are farther from it than any lens sees."""
+    """Normalised coordinates (..., 2), in float32 drawn in towards the axis where they are farther from it than lenses see."""
+    if normalised.dtype != torch.float32:
+        return normalised
     excess = normalised.square().sum(-1, keepdim=True) / _WIDEST**2
     return normalised * excess.clamp_min(1.0).rsqrt()
 
