@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 from torch.masked import MaskedTensor
 
-from torchstickcal.errors import CalibrationError, ObservationError, shown
+from torchstickcal.errors import CalibrationError, ObservationError, quoted
 from torchstickcal.precision import at_least_float32
 
 FARTHEST_PX = 1e7
@@ -106,7 +106,7 @@ def number_of(
     if number is not None and least <= number <= most:
         return number
     is_array = isinstance(value, list | tuple | set | dict) or getattr(value, "ndim", 0) > 0
-    raise error(what, where=where, got=shown(value, quoted=True), expected=expected, remedy=several if is_array else "")
+    raise error(what, where=where, got=quoted(value), expected=expected, remedy=several if is_array else "")
 
 
 def index_of(value: Any) -> int | None:
@@ -125,7 +125,7 @@ def truth_of(value: Any, where: str) -> bool:
     """
     plain = _plain(value)
     if not isinstance(plain, bool | int) or plain not in (0, 1):
-        raise ObservationError("neither yes nor no", where=where, got=shown(value, quoted=True), expected="True or False")
+        raise ObservationError("neither yes nor no", where=where, got=quoted(value), expected="True or False")
     return bool(plain)
 
 
@@ -141,7 +141,7 @@ def names_of(value: Any, where: str, count: int | None = None) -> tuple[str, ...
     are_names = given is not None and all(isinstance(name, str) or index_of(name) is not None for name in given)
     names = tuple(map(name_of, given or ())) if are_names else ()
     if not are_names or len(names) != (len(names) if count is None else count) or len(set(names)) != len(names):
-        got, number = names if are_names else shown(value, quoted=True), "" if count is None else f"{count} "
+        got, number = names if are_names else quoted(value), "" if count is None else f"{count} "
         raise ObservationError("names do not fit the keypoints", where=where, got=got, expected=f"{number}different names")
     return names
 

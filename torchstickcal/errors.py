@@ -8,13 +8,9 @@ from typing import Any, Self, SupportsIndex
 _LONGEST_TEXT = 500
 
 
-def shown(value: object, quoted: bool = False) -> str:
-    """A value as a text of bounded length, whatever it is; in quotation marks if it is itself a text and shall have them."""
-    try:
-        text = repr(value) if quoted and isinstance(value, str) else str(value)
-    except Exception:  # such as for an integer of more than 4300 digits
-        text = f"a value of type {type(value).__name__} that cannot be shown"
-    return text if len(text) <= _LONGEST_TEXT else f"{text[:_LONGEST_TEXT]}..."
+def quoted(value: object) -> object:
+    """A text in quotation marks, as errors show it; every other value as it is."""
+    return repr(value) if isinstance(value, str) else value
 
 
 class CalibrationError(ValueError):
@@ -42,11 +38,11 @@ class CalibrationError(ValueError):
 
     def __init__(self, what: str, *, where: str, got: object, expected: str, remedy: str = "") -> None:
         self.what, self.where, self.got, self.expected, self.remedy = what, where, got, expected, remedy
-        message = f"{what} ({where}): got {shown(got)}; expected {expected}."
+        message = f"{what} ({where}): got {_text(got)}; expected {expected}."
         super().__init__(f"{message} {remedy}" if remedy else message)
 
     def __reduce_ex__(self, protocol: SupportsIndex) -> tuple[Any, ...]:
-        state = {name: value if _can_be_sent(value, protocol) else shown(value) for name, value in self.__dict__.items()}
+        state = {name: value if _can_be_sent(value, protocol) else _text(value) for name, value in self.__dict__.items()}
         return _restored, (type(self), self.args, state)
 
     def __deepcopy__(self, memo: dict[int, Any]) -> Self:
@@ -86,3 +82,12 @@ def _can_be_sent(value: object, protocol: SupportsIndex) -> bool:
     except Exception:  # whatever the value itself raises
         return False
     return True
+
+
+def _text(value: object) -> str:
+    """A value as a text of bounded length, whatever it is."""
+    try:
+        text = str(value)
+    except Exception:  # such as for an integer of more than 4300 digits
+        text = f"a value of type {type(value).__name__} that cannot be shown"
+    return text if len(text) <= _LONGEST_TEXT else f"{text[:_LONGEST_TEXT]}..."

@@ -40,8 +40,8 @@ def in_full_precision(function: Callable[_Arguments, _Result]) -> Callable[_Argu
 
     @functools.wraps(function)
     def guarded(*arguments: _Arguments.args, **keywords: _Arguments.kwargs) -> _Result:
-        device = next(value.device for value in (*arguments, *keywords.values()) if isinstance(value, Tensor))
-        with full_precision(device):
+        tensors = (value for value in (*arguments, *keywords.values()) if isinstance(value, Tensor))
+        with full_precision(next((tensor.device for tensor in tensors), torch.device("cpu"))):
             return function(*arguments, **keywords)
 
     return guarded

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from torchstickcal.arrays import index_of, items_of, name_of, number_of
-from torchstickcal.errors import ObservationError, shown
+from torchstickcal.errors import ObservationError, quoted
 from torchstickcal.registry import suggestion
 
 _LONGEST_STICK_M = 10.0
@@ -120,12 +120,12 @@ def located_sticks(sticks: Any, point_names: Sequence[str] | None) -> tuple[Stic
     given = [sticks] if isinstance(sticks, Stick) else items_of(sticks)
     if given is None:
         remedy = "Give an empty list if the scale comes from elsewhere." if sticks is None else ""
-        raise ObservationError("not a stick", where="sticks", got=shown(sticks, quoted=True), expected=expected, remedy=remedy)
+        raise ObservationError("not a stick", where="sticks", got=quoted(sticks), expected=expected, remedy=remedy)
     located: list[Stick] = []
     for number, stick in enumerate(given):
         where = f"sticks[{number}]"
         if not isinstance(stick, Stick):
-            raise ObservationError("not a stick", where=where, got=shown(stick, quoted=True), expected=expected)
+            raise ObservationError("not a stick", where=where, got=quoted(stick), expected=expected)
         located.append(stick.located(point_names))
         start, end = located[-1].ends
         if any({start, end} == set(other.ends) for other in located[:-1]):
@@ -158,7 +158,5 @@ def _end_of(end: Any, where: str) -> int | str:
         return name_of(end)
     index = index_of(end)
     if index is None:
-        raise ObservationError(
-            "not a point", where=where, got=shown(end, quoted=True), expected="the index or the name of one point"
-        )
+        raise ObservationError("not a point", where=where, got=quoted(end), expected="the index or the name of one point")
     return index

@@ -9,7 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from torchstickcal.arrays import names_of, tensor_of
+from torchstickcal.arrays import names_of, tensor_of, truth_of
 from torchstickcal.errors import ObservationError
 from torchstickcal.geometry.cameras import Intrinsics
 from torchstickcal.model.measurements import Measurements
@@ -62,9 +62,9 @@ class LayerInputs:
         if stick_lengths is None:
             stick_lengths = [stick.length_m for stick in sticks]
         lens = intrinsics if isinstance(intrinsics, Intrinsics) else Intrinsics(intrinsics)
-        distortion = None
+        fisheye, distortion = truth_of(lens.fisheye, "fisheye"), None
         if lens.distortion is not None:
-            distortion = coefficients_of(tensor_of(lens.distortion, "distortion", keep_graph=True), lens.fisheye)
+            distortion = coefficients_of(tensor_of(lens.distortion, "distortion", keep_graph=True), fisheye)
         if distortion is not None:
             distortion = _expanded("distortion", distortion, (sessions, cameras, distortion.shape[-1]), keypoints)
         if image_size is not None:
@@ -72,7 +72,7 @@ class LayerInputs:
         return LayerInputs(
             keypoints,
             None if confidence is None else _confidence(confidence, keypoints),
-            Intrinsics(_expanded("intrinsics", lens.matrix, (sessions, cameras, 3, 3), keypoints), distortion, lens.fisheye),
+            Intrinsics(_expanded("intrinsics", lens.matrix, (sessions, cameras, 3, 3), keypoints), distortion, fisheye),
             _expanded("stick_lengths", stick_lengths, (sessions, len(sticks)), keypoints),
             image_size,
             tuple(sticks),
