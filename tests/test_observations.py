@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from typing import Any
 
 import numpy as np
@@ -209,6 +210,9 @@ def test_keypoints_in_the_corner_are_named():
     with pytest.warns(ObservationWarning, match=r"1 of 60 keypoints lie exactly at \(0, 0\).*Set them to NaN"):
         observations = Observations(**arguments(keypoints=keypoints))
     assert len(observations.warnings) == 1
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert observations.with_stick_length(0.9).to("cpu").warnings == observations.warnings
     unseen = np.ones((3, 5, 4))
     unseen[0, 1, 2] = 0
     assert Observations(**arguments(keypoints=keypoints, confidence=unseen)).warnings == ()
