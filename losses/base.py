@@ -11,6 +11,8 @@ Only the residuals have to be written. The scalar for training loops and LBFGS, 
 slope for exact gradients follow from them by automatic differentiation. A loss that is worth it overrides ``linearise`` and
 ``slope`` with closed forms. Leading dimensions before those named stand for sessions: scalars sum over them, linearised forms
 keep them.
+
+The losses compute in float32 at least, in the highest precision of what they are given, whether or not in an autocast region.
 """
 
 from __future__ import annotations
@@ -22,8 +24,11 @@ import torch
 from torch import Tensor, nn
 from torch.autograd import forward_ad
 
+from torchstickcal.arrays import tensor_of
 from torchstickcal.errors import ConfigError
 from torchstickcal.losses.robust import Quadratic, RobustKernel
+
+_LEAST_SIGMA = 1e-9
 
 
 class Loss(nn.Module):
@@ -34,13 +39,20 @@ class Loss(nn.Module):
             differs between sessions, a tensor that broadcasts against the squared residuals.
         weight: factor on the whole loss (the paper's lambda).
         kernel: robust kernel on squared whitened residuals; None for least squares.
+
+    Raises:
+        ConfigError: if ``sigma`` is a number that is no standard deviation.
+        ObservationError: if it is neither a number nor an array of numbers.
     """
 
     sigma: Tensor
 
     def __init__(self, sigma: float | Tensor = 1.0, weight: float = 1.0, kernel: RobustKernel | None = None) -> None:
         super().__init__()
-        self.register_buffer("sigma", torch.as_tensor(sigma, dtype=torch.float64))
+        self.register_buffer("sigma", tensor_of(sigma, "sigma", keep_graph=True).double())
+        if not isinstance(sigma, Tensor) and not bool((self.sigma >= _LEAST_SIGMA).all()):
+            expected = f"{_LEAST_SIGMA:g} or more"
+            raise ConfigError("not a standard deviation", where=f"{type(self).__name__}.sigma", got=sigma, expected=expected)
         self.weight = weight
         self.kernel = kernel if kernel is not None else Quadratic()
 

@@ -13,6 +13,7 @@ from torchstickcal.geometry import projection
 from torchstickcal.geometry.cameras import Intrinsics, PixelMap
 from torchstickcal.geometry.symmetric import six_entries
 from torchstickcal.losses.base import Loss, checked_residuals, tangent
+from torchstickcal.precision import in_common_precision, in_full_precision
 
 
 class CameraUnknownsAt(Protocol):
@@ -73,6 +74,7 @@ class CameraPointLoss(Loss, ABC):
             intrinsics: the C cameras.
         """
 
+    @in_full_precision
     def forward(
         self,
         points: Tensor,
@@ -90,25 +92,38 @@ class CameraPointLoss(Loss, ABC):
             translations: (..., C, 3), metres, world to camera.
             keypoints: (..., C, F, P, 2), pixels, NaN where not seen.
             intrinsics: the cameras, or camera matrices (3, 3) or (..., C, 3, 3).
-            confidence: (..., C, F, P), 0 to 1; None for 1.
+            confidence: (..., C, F, P), 0 to 1; None for 1. It does not matter where a keypoint was not seen.
 
         Returns:
             A scalar.
         """
         residuals = self.of_scene(points, rotations, translations, keypoints, intrinsics)
         squared = residuals.square().sum(-1) * self.information(residuals)
-        return self.total(squared if confidence is None else squared * confidence)
+        if confidence is not None:
+            squared = squared * confidence.where(keypoints.isfinite().all(-1), 0.0)
+        return self.total(squared)
 
+    @in_full_precision
     def of_scene(
         self, points: Tensor, rotations: Tensor, translations: Tensor, keypoints: Tensor, intrinsics: Intrinsics | Tensor
     ) -> Tensor:
         """Residuals (..., C, F, P, m), zero where a keypoint was not seen or its point is not known."""
-        if not isinstance(intrinsics, Intrinsics):
-            intrinsics = Intrinsics(intrinsics.expand_as(rotations))
-        seen = keypoints.isfinite().all(-1, keepdim=True) & points.isfinite().all(-1, keepdim=True).unsqueeze(-4)
-        points_cam = projection.to_cameras(points.nan_to_num(), rotations, translations)
+        lens = intrinsics if isinstance(intrinsics, Intrinsics) else Intrinsics(intrinsics.expand_as(rotations))
+        given = (
+            points,
+            rotations,
+            translations,
+            keypoints,
+            lens.matrix,
+            *([] if lens.distortion is None else [lens.distortion]),
+        )
+        points, rotations, translations, keypoints, matrix, *distortion = in_common_precision(*given)
+        known = points.isfinite().all(-1, keepdim=True)
+        seen = keypoints.isfinite().all(-1, keepdim=True) & known.unsqueeze(-4)
+        points_cam = projection.to_cameras(points.where(known, 0.0), rotations, translations)
         points_cam = torch.where(seen, points_cam, points.new_tensor([0.0, 0.0, 1.0]))
-        found = self._residuals(points_cam.flatten(-3, -2), keypoints.nan_to_num().flatten(-3, -2), intrinsics)
+        cameras = Intrinsics(matrix, distortion[0] if distortion else None, lens.fisheye)
+        found = self._residuals(points_cam.flatten(-3, -2), keypoints.where(seen, 0.0).flatten(-3, -2), cameras)
         found = found.unflatten(-2, keypoints.shape[-3:-1])
         return torch.where(seen, found, torch.zeros_like(found))
 

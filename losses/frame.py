@@ -12,6 +12,7 @@ from torch.autograd import forward_ad
 from torchstickcal.errors import ConfigError
 from torchstickcal.geometry.symmetric import six_entries
 from torchstickcal.losses.base import Loss, checked_residuals, tangent
+from torchstickcal.precision import at_least_float32, in_full_precision
 
 
 class FrameTerms(NamedTuple):
@@ -59,6 +60,7 @@ class FrameLoss(Loss, ABC):
             sticks, lengths_m = torch.zeros(0, 2, dtype=torch.long, device=points.device), points.new_zeros(0)
         return self.of_session(points, sticks, lengths_m.unsqueeze(-2))
 
+    @in_full_precision
     def of_session(self, points: Tensor, sticks: Tensor, lengths_m: Tensor) -> Tensor:
         """The loss, a scalar, of a session's points (..., F, P, 3), NaN for points that are not known.
 
@@ -67,7 +69,7 @@ class FrameLoss(Loss, ABC):
             sticks: (S, 2), the ends of its sticks.
             lengths_m: their given lengths, (..., 1, S).
         """
-        grouped = points[..., self.checked_groups(sticks, points.shape[-2]), :]
+        grouped = at_least_float32(points)[..., self.checked_groups(sticks, points.shape[-2]), :]
         known = grouped.isfinite().all(-1).all(-1)
         squared = self._squared(grouped, known, lengths_m)
         return self.total(squared * self.information(squared))

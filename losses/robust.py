@@ -7,10 +7,11 @@ the weight of iteratively re-weighted least squares; LBFGS and training loops di
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Any, Protocol
 
 from torch import Tensor
 
+from torchstickcal.arrays import number_of
 from torchstickcal.errors import ConfigError
 
 
@@ -50,6 +51,9 @@ class Cauchy:
 
     scale: float = 2.4
 
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "scale", _scale(self.scale))
+
     def rho(self, squared: Tensor) -> Tensor:
         return self.scale**2 * (squared / self.scale**2).log1p()
 
@@ -65,6 +69,9 @@ class Huber:
     """rho(s) = s up to c^2, then 2 c sqrt(s) - c^2."""
 
     scale: float = 1.35
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "scale", _scale(self.scale))
 
     def rho(self, squared: Tensor) -> Tensor:
         linear = 2 * self.scale * squared.clamp_min(self.scale**2).sqrt() - self.scale**2
@@ -83,6 +90,9 @@ class GemanMcClure:
     """rho(s) = s / (1 + s / c^2): bounded by c^2, so a gross outlier has no pull."""
 
     scale: float = 8.0
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "scale", _scale(self.scale))
 
     def rho(self, squared: Tensor) -> Tensor:
         return squared / (1 + squared / self.scale**2)
@@ -109,6 +119,16 @@ def robust_kernel(name: str, scale: float | None = None) -> RobustKernel:
     """
     if name not in _KERNELS:
         raise ConfigError("unknown robust kernel", where="kernel", got=repr(name), expected=f"one of {', '.join(_KERNELS)}")
-    if scale is not None and not scale > 0:
-        raise ConfigError("kernel scale is not usable", where="kernel_scale", got=scale, expected="a number above 0")
+    if scale is not None:
+        scale = _scale(scale)
     return Quadratic() if name == "none" else _KERNELS[name](*([] if scale is None else [scale]))
+
+
+def _scale(value: Any) -> float:
+    """A kernel's scale.
+
+    Raises:
+        ConfigError: if it is none.
+    """
+    what, expected = "kernel scale is not usable", "a number above 0, in standard deviations"
+    return number_of(value, "kernel_scale", what=what, expected=expected, least=1e-6, most=1e6, error=ConfigError)

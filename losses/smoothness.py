@@ -10,9 +10,11 @@ from torch import Tensor
 
 from torchstickcal.losses.registry import LossContext, LossSettings, register_loss
 from torchstickcal.losses.track import TrackLoss, combined
+from torchstickcal.precision import at_least_float32, in_full_precision
 from torchstickcal.settings import Positive
 
 
+@in_full_precision
 def second_differences(points: Tensor) -> Tensor:
     """``X[f-1] - 2 X[f] + X[f+1]``, (..., F - 2, P, 3), of points (..., F, P, 3), metres; zero where one of the three is NaN.
 
@@ -21,7 +23,7 @@ def second_differences(points: Tensor) -> Tensor:
         >>> second_differences(torch.tensor([0.0, 1.0, 4.0])[:, None, None].expand(3, 1, 3))
         tensor([[[2., 2., 2.]]])
     """
-    difference = combined(points, SmoothnessLoss.stencil, dim=-3)
+    difference = combined(at_least_float32(points), SmoothnessLoss.stencil, dim=-3)
     return torch.where(difference.isfinite().all(-1, keepdim=True), difference, torch.zeros_like(difference))
 
 

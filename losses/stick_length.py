@@ -11,11 +11,13 @@ from torch import Tensor
 from torchstickcal.geometry.symmetric import DIAGONAL, expand, outer
 from torchstickcal.losses.frame import FrameLoss, FrameTerms
 from torchstickcal.losses.registry import LossContext, LossSettings, register_loss
+from torchstickcal.precision import in_common_precision, in_full_precision
 from torchstickcal.settings import Positive
 
 _MIN_LENGTH_M = 1e-6
 
 
+@in_full_precision
 def stick_lengths(starts: Tensor, ends: Tensor) -> Tensor:
     """Distances (...) of stick ends (..., 3), metres, clamped below at 1e-6 m so that a gradient exists; NaN where an end is.
 
@@ -26,6 +28,7 @@ def stick_lengths(starts: Tensor, ends: Tensor) -> Tensor:
     """
     from kornia.geometry.linalg import batched_squared_norm
 
+    starts, ends = in_common_precision(starts, ends)
     return batched_squared_norm(ends - starts).clamp_min(_MIN_LENGTH_M**2).sqrt()
 
 
@@ -43,6 +46,7 @@ class StickLengthLoss(FrameLoss):
         tensor(4.)
     """
 
+    @in_full_precision
     def forward(self, starts: Tensor, ends: Tensor, length_m: float | Tensor) -> Tensor:  # pyright: ignore[reportIncompatibleMethodOverride]
         """The loss, a scalar, of stick ends (..., F, S, 3) or (F, 3), metres; frames in which an end is NaN do not count.
 
@@ -51,6 +55,7 @@ class StickLengthLoss(FrameLoss):
             ends: the other.
             length_m: the known length, one number or one per stick (S,).
         """
+        starts, ends = in_common_precision(starts, ends)
         lengths = torch.as_tensor(length_m, dtype=starts.dtype, device=starts.device)
         grouped = torch.stack([starts, ends], dim=-2)
         squared = self._squared(grouped, grouped.isfinite().all(-1).all(-1), lengths)

@@ -10,6 +10,7 @@ from torch import Tensor
 
 from torchstickcal.errors import ConfigError
 from torchstickcal.losses.base import Loss
+from torchstickcal.precision import at_least_float32, in_full_precision
 
 
 class TrackTerms(NamedTuple):
@@ -43,10 +44,13 @@ class TrackLoss(Loss, ABC):
                 expected="2 or 3 factors",
             )
 
+    @in_full_precision
     def forward(self, points: Tensor) -> Tensor:
         """The loss, a scalar, of points (..., F, P, 3), metres; NaN for points that are not known."""
-        complete = consecutive(points.isfinite().all(-1), len(self.stencil))
-        squared = combined(points.nan_to_num(), self.stencil, dim=-3).square().sum(-1) * complete
+        known = points.isfinite().all(-1)
+        complete = consecutive(known, len(self.stencil))
+        differences = combined(at_least_float32(points).where(known[..., None], 0.0), self.stencil, dim=-3)
+        squared = differences.square().sum(-1) * complete
         return self.total(squared * self.information(squared))
 
     def linearise(self, points: Tensor, active: Tensor) -> TrackTerms:

@@ -12,7 +12,7 @@ import torchstickcal
 
 ROOT = Path(__file__).parents[1]
 FLOORS = [
-    ["errors", "files", "workers"],
+    ["errors", "files", "workers", "precision", "arrays"],
     ["registry"],
     ["settings"],
     ["geometry"],

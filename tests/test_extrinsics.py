@@ -87,3 +87,15 @@ def test_an_optimiser_of_torch_finds_the_poses(perfect):
 def test_wrong_shapes_are_refused():
     with pytest.raises(ObservationError, match="expected \\(C, 3, 3\\) and \\(C, 3\\)"):
         Extrinsics(torch.eye(3), torch.zeros(3))
+
+
+def test_arrays_and_lists_are_accepted_and_other_shapes_refused():
+    rotations, translations = poses()
+    found = Extrinsics(rotations.numpy(), translations.tolist())()
+    assert torch.equal(found[0], Extrinsics(rotations, translations)()[0])
+    assert Extrinsics(rotations.float().requires_grad_(), translations)()[1].dtype == torch.float64
+    for wrong in ((rotations, translations[..., None]), (rotations[0], translations[0]), (rotations[:0], translations[:0])):
+        with pytest.raises(ObservationError, match="poses have the wrong shape"):
+            Extrinsics(*wrong)
+    with pytest.raises(ObservationError, match=r"not an array of numbers \(translations\)"):
+        Extrinsics(rotations, None)

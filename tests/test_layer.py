@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any, NamedTuple
 
+import numpy as np
 import pytest
 import torch
 from torch import Tensor
@@ -198,3 +199,84 @@ def test_shapes_that_do_not_fit_are_refused():
         layer(OBSERVATIONS.keypoints, OBSERVATIONS.cameras, torch.ones(3))
     with pytest.raises(ObservationError, match="intrinsics"):
         layer(OBSERVATIONS.keypoints, torch.eye(3).expand(5, 3, 3))
+
+
+def test_arrays_of_every_kind_are_calibrated_alike():
+    layer, keypoints, cameras = CalibrationLayer(STICK), OBSERVATIONS.keypoints, OBSERVATIONS.cameras
+    expected = layer(keypoints, cameras)
+    matrix, distortion = cameras.matrix.numpy(), cameras.distortion.numpy()
+    for given in (keypoints.numpy()[:, ::-1][:, ::-1], keypoints.tolist(), list(keypoints), np.ma.masked_invalid(keypoints)):
+        result = layer(given, Intrinsics(matrix, distortion[:, None]), [1.0], np.ones(keypoints.shape[:3]))
+        assert result.status == ("converged",)
+        assert torch.equal(result.translations, expected.translations)
+
+
+@pytest.mark.parametrize(
+    ("dtype", "expected"),
+    [
+        (torch.int64, torch.float64),
+        (torch.int16, torch.float64),
+        (torch.float16, torch.float32),
+        (torch.bfloat16, torch.float32),
+    ],
+)
+def test_results_are_in_float32_at_least(dtype: torch.dtype, expected: torch.dtype):
+    keypoints = OBSERVATIONS.keypoints.nan_to_num(500.0).to(dtype)
+    result, same = (CalibrationLayer(STICK)(given, OBSERVATIONS.cameras) for given in (keypoints, keypoints.double()))
+    assert result.rotations.dtype == result.intrinsics.dtype == expected
+    torch.testing.assert_close(result.rotations.double(), same.rotations, rtol=0, atol=1e-6)
+    torch.testing.assert_close(result.intrinsics.double(), OBSERVATIONS.cameras.matrix, rtol=1e-6, atol=0)
+
+
+def test_arguments_that_do_not_fit_are_errors_and_no_status():
+    keypoints, cameras = OBSERVATIONS.keypoints, OBSERVATIONS.cameras
+    layer, confidence = CalibrationLayer(STICK), torch.ones(keypoints.shape[:3])
+    for wrong in (confidence.transpose(1, 2), confidence.transpose(0, 1), confidence[:, :-1], confidence[:, :1], "x"):
+        with pytest.raises(ObservationError, match="confidence"):
+            layer(keypoints, cameras, confidence=wrong)
+    for wrong in (keypoints[0], keypoints[:1], keypoints[:, :0], keypoints[..., :1], None):
+        with pytest.raises(ObservationError, match="keypoints"):
+            layer(wrong, cameras)
+    with pytest.raises(ObservationError, match="a stick's end is not a tracked point"):
+        layer(keypoints[:, :, :5], cameras)
+    with pytest.raises(ObservationError, match="distortion has the wrong shape"):
+        layer(keypoints, Intrinsics(cameras.matrix, cameras.distortion[:, :3]))
+    with pytest.raises(ObservationError, match=r"image_size.*\(3,\)"):
+        layer(keypoints, cameras, image_size=(1, 2, 3))
+    with pytest.raises(ObservationError, match="two sticks have the same ends"):
+        CalibrationLayer([STICK, STICK])
+
+
+def test_no_sessions_give_no_results():
+    keypoints = OBSERVATIONS.keypoints[None, ...][:0].requires_grad_()
+    result = CalibrationLayer(STICK, {"extends": "default", "refine": ["focal"]})(keypoints, OBSERVATIONS.cameras)
+    cameras, frames, points, _ = keypoints.shape[1:]
+    assert result.status == ()
+    shapes = {"rotations": (0, cameras, 3, 3), "points": (0, frames, points, 3), "inliers": (0, *keypoints.shape[1:4])}
+    assert {name: tuple(getattr(result, name).shape) for name in shapes} == shapes
+    result.points.sum().backward()
+    assert keypoints.grad.shape == keypoints.shape
+
+
+@pytest.mark.parametrize("bad", [torch.nan, torch.inf, 1e8, 1e154, 1e300])
+def test_a_batch_that_fails_has_gradients_of_zero(bad: float):
+    given = inputs()
+    keypoints = torch.stack([OBSERVATIONS.keypoints, torch.full_like(OBSERVATIONS.keypoints, bad)])
+    for sessions in ([1], [1, 1], [0, 1]):
+        leaves = [v.clone().requires_grad_() for v in (keypoints[sessions], given.matrix, given.lengths)]
+        result = CalibrationLayer(STICK)(*leaves)
+        assert result.converged.tolist() == [session == 0 for session in sessions]
+        (result.rotations.sum() + result.translations.sum() + result.points.sum()).backward()
+        assert all(leaf.grad.isfinite().all() for leaf in leaves)
+        assert not leaves[0].grad[1 if 0 in sessions else slice(None)].any()
+
+
+def test_lens_models_of_different_length_in_one_batch():
+    lens = torch.zeros(2, 4, 14, dtype=torch.float64)
+    lens[0, :, 12:] = 0.01
+    lens.requires_grad_()
+    keypoints = OTHER.keypoints.expand(2, -1, -1, -1, -1)
+    result = CalibrationLayer(STICK)(keypoints, Intrinsics(OTHER.intrinsics.expand(2, 4, 3, 3), lens))
+    assert result.status == ("converged", "converged")
+    result.points.sum().backward()
+    assert (lens.grad.abs().sum(1) > 0).all()

@@ -5,13 +5,15 @@ from __future__ import annotations
 import math
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
 from torch import Tensor
 
-from torchstickcal import ConfigError, Intrinsics
+from torchstickcal import ConfigError, Extrinsics, Intrinsics, ObservationError
 from torchstickcal.losses import (
     Cauchy,
     GemanMcClure,
@@ -22,6 +24,8 @@ from torchstickcal.losses import (
     StickLengthLoss,
     reprojection_residuals,
     robust_kernel,
+    second_differences,
+    stick_lengths,
 )
 
 KERNELS = [Quadratic(), Cauchy(1.3), Huber(1.3), GemanMcClure(2.0)]
@@ -205,3 +209,121 @@ def test_the_folder_is_refused_under_its_own_name():
     run = subprocess.run([sys.executable, "-c", "import losses"], cwd=root, capture_output=True, text=True, check=False)
     assert run.returncode != 0
     assert "import torchstickcal.losses" in run.stderr
+
+
+LENSES = {
+    "perfect": (0, False),
+    "standard": (5, False),
+    "rational": (8, False),
+    "prism": (12, False),
+    "tilted": (14, False),
+    "fisheye": (4, True),
+}
+
+
+def arguments(dtype: torch.dtype) -> list[Any]:
+    s = scene()
+    tensors = [s[name].to(dtype) for name in ("points", "rotations", "translations", "keypoints")]
+    return [*tensors, s["intrinsics"].to(dtype)]
+
+
+COMPUTED: dict[str, Callable[[torch.dtype], Tensor]] = {
+    "ReprojectionLoss": lambda dtype: ReprojectionLoss()(*arguments(dtype)),
+    "ReprojectionLoss.forward": lambda dtype: ReprojectionLoss().forward(*arguments(dtype)),
+    "reprojection_residuals": lambda dtype: reprojection_residuals(*arguments(dtype)),
+    "StickLengthLoss": lambda dtype: StickLengthLoss(0.1)(random(F, 3).to(dtype), random(F, 3, seed=1).to(dtype), 1.15),
+    "StickLengthLoss.of_session": lambda dtype: StickLengthLoss(0.1).of_session(
+        random(F, P, 3).to(dtype), torch.tensor([[0, 1]]), torch.tensor([[1.15]])
+    ),
+    "stick_lengths": lambda dtype: stick_lengths(random(F, 3).to(dtype), random(F, 3, seed=1).to(dtype)),
+    "SmoothnessLoss": lambda dtype: SmoothnessLoss(0.01)(random(F, P, 3).to(dtype)),
+    "second_differences": lambda dtype: second_differences(random(F, P, 3).to(dtype)),
+    "Extrinsics": lambda dtype: torch.cat([v.flatten() for v in Extrinsics(*arguments(dtype)[1:3])()]),
+    "Extrinsics.to": lambda dtype: torch.cat([v.flatten() for v in Extrinsics(*arguments(torch.float32)[1:3]).to(dtype)()]),
+    "Extrinsics.compose": lambda dtype: Extrinsics(*arguments(dtype)[1:3]).compose(random(C - 1, 6).to(dtype))[0],
+}
+
+
+@pytest.mark.parametrize("name", COMPUTED)
+def test_nothing_is_computed_below_float32(name: str):
+    """Neither in an autocast region nor with half-precision input, whose values are exact."""
+    compute = COMPUTED[name]
+    for dtype in (torch.float16, torch.bfloat16, torch.float32, torch.float64):
+        expected = compute(dtype)
+        assert expected.dtype == (torch.float64 if dtype == torch.float64 else torch.float32)
+        for cast in (torch.bfloat16, torch.float16):
+            with torch.autocast("cpu", dtype=cast):
+                assert torch.equal(compute(dtype), expected)
+
+
+def test_integers_and_mixed_precisions_are_computed_in_the_highest():
+    points, rotations, translations, keypoints, cameras = arguments(torch.float64)
+    expected = ReprojectionLoss()(points, rotations, translations, keypoints, cameras)
+    mixed = ReprojectionLoss()(points.float(), rotations, translations.float(), keypoints, cameras.to(torch.float32))
+    assert mixed.dtype == torch.float64
+    torch.testing.assert_close(mixed, expected, rtol=1e-4, atol=0)
+    ends = torch.zeros(1, 3, dtype=torch.long), torch.tensor([[0, 3, 4]])
+    assert StickLengthLoss()(*ends, 4.5).item() == pytest.approx(0.25)
+
+
+@pytest.mark.parametrize("kernel", KERNELS, ids=lambda k: type(k).__name__)
+@pytest.mark.parametrize("lens", LENSES)
+def test_reprojection_of_points_in_every_place_has_finite_gradients(kernel, lens: str):
+    places = [[0, 0, 0], [1, 0, 0], [0, 0, -0.0], [1e4, 3, 0], [0, 0, -3], [0.1, 0.2, -3], [0.3, 0.1, 1e-9], [0.3, 0.1, -1e-5]]
+    places += [[1, 1, 1e-3], [100, 100, 1e-3], [1e10, 1e10, 1e10], [0, 0, 5], [0.1, 0.1, 4]]
+    coefficients, fisheye = LENSES[lens]
+    for dtype in (torch.float32, torch.float64):
+        matrix = torch.tensor([[1000.0, 0, 960], [0, 1000, 540], [0, 0, 1]], dtype=dtype)[None].requires_grad_()
+        distortion = torch.full((1, coefficients), 0.01, dtype=dtype).requires_grad_() if coefficients else None
+        points = torch.tensor([places], dtype=dtype).requires_grad_()
+        rotation, translation = (
+            torch.eye(3, dtype=dtype)[None].requires_grad_(),
+            torch.zeros(1, 3, dtype=dtype).requires_grad_(),
+        )
+        keypoints = torch.full((1, 1, len(places), 2), 500.0, dtype=dtype).requires_grad_()
+        given = [points, rotation, translation, keypoints, matrix, *([] if distortion is None else [distortion])]
+        cameras = Intrinsics(matrix, distortion, fisheye)
+        value = ReprojectionLoss(0.5, kernel=kernel)(points, rotation, translation, keypoints, cameras)
+        assert value.isfinite()
+        assert all(gradient.isfinite().all() for gradient in torch.autograd.grad(value, given))
+
+
+@pytest.mark.parametrize("kernel", KERNELS, ids=lambda k: type(k).__name__)
+@pytest.mark.parametrize("missing", [torch.nan, torch.inf])
+def test_what_is_missing_has_no_gradient(kernel, missing: float):
+    points, rotations, translations, keypoints, cameras = arguments(torch.float64)
+    keypoints[0, 1, 2], keypoints[1, 0, 0, 1], points[3, 1] = missing, missing, missing
+    confidence = torch.ones(C, F, P).where(keypoints.isfinite().all(-1), missing).requires_grad_()
+    points.requires_grad_()
+    keypoints.requires_grad_()
+    value = ReprojectionLoss(kernel=kernel)(points, rotations, translations, keypoints, cameras, confidence)
+    value = value + SmoothnessLoss(0.1, kernel=kernel)(points) + StickLengthLoss(kernel=kernel)(points[:, 1], points[:, 2], 1.0)
+    value.backward()
+    assert value.isfinite()
+    for tensor in (points, keypoints, confidence):
+        assert tensor.grad.isfinite().all()
+    assert not keypoints.grad[0, 1, 2].any()
+    assert not keypoints.grad[1, 0, 0].any()
+    assert not points.grad[3, 1].any()
+
+
+@pytest.mark.parametrize("kernel", KERNELS, ids=lambda k: type(k).__name__)
+def test_points_at_rest_and_sticks_without_length_have_finite_gradients(kernel):
+    for dtype in (torch.float16, torch.float32, torch.float64):
+        points = torch.zeros(F, P, 3, dtype=dtype).requires_grad_()
+        value = SmoothnessLoss(0.01, kernel=kernel)(points) + StickLengthLoss(0.1, kernel=kernel)(
+            points[:, 0], points[:, 1], 1.0
+        )
+        value.backward()
+        assert value.isfinite()
+        assert points.grad.isfinite().all()
+
+
+@pytest.mark.parametrize("value", [0, -1.0, "x", None, float("nan"), 10**400, [1.0]])
+def test_unusable_kernel_scales_and_sigmas_are_refused(value: Any):
+    for kernel in (Cauchy, Huber, GemanMcClure):
+        with pytest.raises(ConfigError, match="kernel scale is not usable"):
+            kernel(value)
+    if value != [1.0]:
+        with pytest.raises((ConfigError, ObservationError), match="sigma"):
+            ReprojectionLoss(value)

@@ -7,6 +7,7 @@ import math
 import pytest
 import torch
 
+from torchstickcal import ObservationError
 from torchstickcal.geometry import se3
 from torchstickcal.metrics import align, pose_errors, rotation_angle
 
@@ -55,3 +56,17 @@ def test_alignment_never_mirrors():
     points = torch.randn(10, 3, dtype=torch.float64)
     rotation, _ = align(points, points * torch.tensor([-1.0, 1, 1]))
     assert torch.det(rotation).item() == pytest.approx(1.0)
+
+
+def test_arrays_and_lists_are_measured_and_other_shapes_refused():
+    rotations, translations = rig(3)
+    expected = pose_errors(rotations, 1.1 * translations, rotations, translations).translation_m
+    found = pose_errors(
+        rotations.numpy(), (1.1 * translations).tolist(), rotations.numpy(), translations.tolist()
+    ).translation_m
+    assert torch.equal(found, expected)
+    for wrong in (translations[0], translations[:2], translations[..., None], translations[None], None, "x"):
+        with pytest.raises(ObservationError, match="translations"):
+            pose_errors(rotations, wrong, rotations, translations)
+        with pytest.raises(ObservationError, match="translations"):
+            pose_errors(rotations, translations, rotations, wrong)

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import warnings
 from typing import Any
 
 import numpy as np
 import pytest
 import torch
 
-from torchstickcal import ObservationError, Observations, Stick
+from torchstickcal import ObservationError, Observations, Stick, calibrate
+from torchstickcal.errors import ObservationWarning
+from torchstickcal.simulate import Noise, golf_session
 
 K = [[1000.0, 0, 500], [0, 1000, 400], [0, 0, 1]]
 
@@ -58,6 +61,22 @@ def stick_seen_by_one() -> np.ndarray:
         ({"sticks": Stick("tip", 1, 1.0)}, r"no such point.*'tip'.*points have no names"),
         ({"sticks": Stick("tipp", 1, 1.0), "point_names": ["a", "tip", "c", "d"]}, r"'tipp'.*Did you mean 'tip'"),
         ({"sticks": [1.0]}, "not a stick"),
+        ({"sticks": None}, r"not a stick \(sticks\).*an empty list"),
+        ({"sticks": "tip"}, "not a stick"),
+        ({"keypoints": None}, r"not an array of numbers \(keypoints\)"),
+        ({"intrinsics": None, "image_size": (640, 480, 3)}, r"image size.*\(2,\) or \(3, 2\)"),
+        ({"image_size": (np.inf, 480)}, "image size"),
+        ({"fps": [30, 60, 60]}, "frame rate.*give timestamps"),
+        ({"fps": "abc"}, r"frame rate.*'abc'"),
+        ({"fps": 1e308}, "frame rate"),
+        ({"readout_s": [0.01, 0.01, 0.02], "fps": 60, "image_size": (640, 480)}, "not a read-out time.*timestamps"),
+        ({"point_names": 5}, "names do not fit"),
+        ({"point_names": "abcd"}, "names do not fit"),
+        ({"fisheye": [True, False, False]}, r"neither yes nor no \(fisheye\)"),
+        ({"keypoints": changed(1e154, (1, 2, 3, 0))}, r"outside any image \(keypoints\[1, 2, 3\]\)"),
+        ({"intrinsics": np.diag([1e154, 1e154, 1.0])}, "not a camera matrix"),
+        ({"distortion": [1e154] * 5}, "distortion is not finite"),
+        ({"confidence": np.full((3, 5, 4), 37.0)}, "Divide the scores of a heat map by the largest"),
     ],
 )
 def test_bad_input_is_refused(changes: dict[str, Any], message: str):
@@ -74,9 +93,21 @@ def test_bad_input_is_refused(changes: dict[str, Any], message: str):
         ((0, 1, float("nan")), "not a length"),
         ((0, 1, 1150.0), r"millimetres.*Divide by 1000: 1.15 m"),
         ((0, 1, 86.0), r"centimetres.*Divide by 100: 0.86 m"),
+        ((0, 1, 1e-300), "not a length"),
+        ((0, 1, 10**400), "not a length"),
+        ((0, 1, "1"), r"not a length \(Stick.length_m\): got '1'"),
+        ((0, 1, None), "not a length"),
+        ((0, 1, True), "not a length"),
+        ((0, 1, [1.0, 1.2]), "each stick its own"),
+        ((0, 1, 1.0, 0), r"not a length \(Stick.sigma_m\)"),
+        ((0, 1, 1.0, 1e300), r"not a length \(Stick.sigma_m\)"),
+        ((0.5, 1, 1.0), r"not a point \(Stick.start\)"),
+        ((0, True, 1.0), r"not a point \(Stick.end\)"),
+        ((0, None, 1.0), "not a point"),
+        ((1, np.int64(1), 1.0), "two different ends"),
     ],
 )
-def test_bad_sticks_are_refused(values: tuple[int, int, float], message: str):
+def test_bad_sticks_are_refused(values: tuple[Any, ...], message: str):
     with pytest.raises(ObservationError, match=message):
         Stick(*values)
 
@@ -113,3 +144,85 @@ def test_stick_length_can_be_replaced():
     two = Observations(**arguments(sticks=[Stick(0, 1, 1.0), Stick(2, 3, 1.0)]))
     with pytest.raises(ObservationError, match="2 sticks"):
         two.with_stick_length(0.9)
+
+
+def test_numbers_of_a_stick_are_kept_as_plain_numbers():
+    stick = Stick(np.int64(19), torch.tensor(20), np.float32(1.5), np.float64(0.01))
+    assert stick == Stick(19, 20, 1.5, 0.01)
+    assert [type(value) for value in (stick.start, stick.end, stick.length_m, stick.sigma_m)] == [int, int, float, float]
+
+
+def test_masked_values_are_not_seen():
+    given = arguments()
+    mask = np.zeros(given["keypoints"].shape, bool)
+    mask[0, 1, 2] = True
+    keypoints = np.ma.masked_array(given["keypoints"], mask)
+    confidence = np.ma.masked_array(np.full((3, 5, 4), 2.0), np.arange(60).reshape(3, 5, 4) != 7)
+    confidence.data[0, 1, 3] = 0.5
+    assert Observations(**given | {"keypoints": keypoints}).visible.logical_not().nonzero().tolist() == [[0, 1, 2]]
+    seen = Observations(keypoints, K, [], confidence=confidence).visible
+    assert seen.nonzero().tolist() == [[0, 1, 3]]
+    assert not Observations(np.ma.masked_all_like(keypoints), K, Stick(2, 3, 1.0)).visible.any()
+    with pytest.raises(ObservationError, match=r"9 masked values"):
+        Observations(**given | {"intrinsics": np.ma.masked_all((3, 3))})
+
+
+@pytest.mark.parametrize("count", [4, 5, 8, 12, 14])
+def test_distortion_as_opencv_returns_it(count: int):
+    lens, many = np.full(count, 1e-3), np.full((3, count), 1e-3)
+    for shape in ((count,), (1, count), (count, 1), (1, 1, count)):
+        assert Observations(**arguments(distortion=lens.reshape(shape))).distortion.tolist() == lens.tolist()
+    for shape in ((3, count), (3, 1, count), (3, count, 1)):
+        assert Observations(**arguments(distortion=many.reshape(shape))).distortion.tolist() == many.tolist()
+    assert Observations(**arguments(intrinsics=[K])).intrinsics.tolist() == K
+
+
+def test_coefficients_that_are_zero_do_not_make_a_sensor_tilted():
+    lens = np.zeros((1, 14))
+    lens[0, :8] = [1.7, 0.7, 1e-4, -2e-4, 0.03, 2.0, 1.2, 0.16]
+    observations = Observations(**arguments(distortion=lens))
+    assert observations.distortion.shape == (14,)
+    assert observations.cameras.distortion.shape == (3, 8)
+    assert Observations(**arguments(distortion=np.zeros((1, 0)))).distortion is None
+
+
+def test_keypoints_in_half_precision_do_not_round_the_cameras():
+    observations, _ = golf_session(cameras=3, frames=10, noise=Noise(sigma_px=1.0))
+    half = observations.keypoints.half()
+    matrix = [[1201.37, 0, 960], [0, 1201.37, 540], [0, 0, 1]]
+    short, long = (calibrate(Observations(keypoints, matrix, observations.sticks)) for keypoints in (half, half.double()))
+    assert short.intrinsics.dtype == short.translations.dtype == torch.float32
+    assert float(short.intrinsics[0, 0, 0]) == pytest.approx(1201.37)
+    torch.testing.assert_close(short.translations.double(), long.translations, rtol=0, atol=1e-5)
+
+
+def test_what_requires_gradients_is_calibrated_without_them():
+    observations, _ = golf_session(cameras=3, frames=10, noise=Noise(sigma_px=1.0))
+    matrix = observations.intrinsics.clone().requires_grad_()
+    by_camera = [camera.clone().requires_grad_() for camera in observations.keypoints]
+    given = Observations(by_camera, matrix, observations.sticks, distortion=observations.distortion)
+    found = calibrate(given).translations
+    assert torch.equal(found, calibrate(observations).translations)
+
+
+def test_keypoints_in_the_corner_are_named():
+    keypoints = changed(0.0, (0, 1, 2)).astype(np.float32)
+    with pytest.warns(ObservationWarning, match=r"1 of 60 keypoints lie exactly at \(0, 0\).*Set them to NaN"):
+        observations = Observations(**arguments(keypoints=keypoints))
+    assert len(observations.warnings) == 1
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert observations.with_stick_length(0.9).to("cpu").warnings == observations.warnings
+    unseen = np.ones((3, 5, 4))
+    unseen[0, 1, 2] = 0
+    assert Observations(**arguments(keypoints=keypoints, confidence=unseen)).warnings == ()
+    assert Observations(**arguments(keypoints=changed(0.0, (0, 1, 2, 0)))).warnings == ()
+
+
+def test_a_calibration_names_keypoints_in_the_corner():
+    observations, _ = golf_session(cameras=3, frames=10, noise=Noise(sigma_px=1.0))
+    keypoints = observations.keypoints.clone()
+    keypoints[0, 2, 3] = 0.0
+    with pytest.warns(ObservationWarning):
+        calibration = calibrate(Observations(keypoints, observations.intrinsics, observations.sticks))
+    assert "(0, 0)" in calibration.warnings[0]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from torchstickcal import Calibration, Observations, calibrate
+from torchstickcal import Calibration, ObservationError, Observations, calibrate
 from torchstickcal.config import InitialiseSettings
 from torchstickcal.geometry import se3
 from torchstickcal.io import Truth
@@ -137,3 +137,19 @@ def calibrate_points(calibration: Calibration, keypoints: torch.Tensor) -> torch
     points = triangulated(measurements, *poses, InitialiseSettings())
     objective = Objective(measurements, {"reprojection": ReprojectionLoss()})
     return polish(objective, State.of(*poses, points), cameras_free=False).points[0].mT
+
+
+def test_precision_of_points_given_in_any_form(noisy: tuple[Observations, Truth]):
+    calibration = calibrate(noisy[0])
+    expected = calibration.predict_std(torch.tensor([[0.0, 0, 6], [0, 1, 7]], dtype=torch.float64))
+    assert (expected > 0).all()
+    for points in ([[0, 0, 6], [0, 1, 7]], torch.tensor([[0, 0, 6], [0, 1, 7]]), torch.tensor([[0, 0, 6.0], [0, 1, 7]]).half()):
+        found = calibration.predict_std(points)
+        assert found.dtype in (torch.float64, torch.float32)
+        torch.testing.assert_close(found.double(), expected, rtol=1e-5, atol=0)
+    for wrong in ([1.0, 2.0], "x", None):
+        with pytest.raises(ObservationError, match="points"):
+            calibration.predict_std(wrong)
+    for noise in (0, "x", [1.0], 10**400):
+        with pytest.raises(ObservationError, match="sigma_px"):
+            calibration.predict_std([0, 0, 6], noise)

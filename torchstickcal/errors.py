@@ -2,6 +2,16 @@
 
 from __future__ import annotations
 
+import pickle
+from typing import Any, Self, SupportsIndex
+
+_LONGEST_TEXT = 500
+
+
+def quoted(value: object) -> object:
+    """A text in quotation marks, as errors show it; every other value as it is."""
+    return repr(value) if isinstance(value, str) else value
+
 
 class CalibrationError(ValueError):
     """Base class of all errors that torchstickcal raises on purpose.
@@ -12,6 +22,8 @@ class CalibrationError(ValueError):
         got: the given value or shape.
         expected: what would be accepted.
         remedy: how to fix the problem, one or more sentences.
+
+    It can be copied and sent to other processes with all of these; ``got`` arrives as a text if it cannot be sent itself.
 
     Example:
         >>> import torch
@@ -26,8 +38,15 @@ class CalibrationError(ValueError):
 
     def __init__(self, what: str, *, where: str, got: object, expected: str, remedy: str = "") -> None:
         self.what, self.where, self.got, self.expected, self.remedy = what, where, got, expected, remedy
-        message = f"{what} ({where}): got {got}; expected {expected}."
+        message = f"{what} ({where}): got {_text(got)}; expected {expected}."
         super().__init__(f"{message} {remedy}" if remedy else message)
+
+    def __reduce_ex__(self, protocol: SupportsIndex) -> tuple[Any, ...]:
+        state = {name: value if _can_be_sent(value, protocol) else _text(value) for name, value in self.__dict__.items()}
+        return _restored, (type(self), self.args, state)
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> Self:
+        return pickle.loads(pickle.dumps(self))
 
 
 class ObservationError(CalibrationError):
@@ -44,3 +63,31 @@ class ConfigError(CalibrationError):
 
 class FileFormatError(CalibrationError):
     """A file that is damaged, unsafe, or not in the expected format."""
+
+
+class ObservationWarning(UserWarning):
+    """Observations that can be used, but probably do not mean what they say."""
+
+
+def _restored(kind: type[CalibrationError], arguments: tuple[Any, ...], state: dict[str, Any]) -> CalibrationError:
+    """An error as it was before it was copied or sent."""
+    error = kind.__new__(kind, *arguments)
+    error.__dict__.update(state)
+    return error
+
+
+def _can_be_sent(value: object, protocol: SupportsIndex) -> bool:
+    try:
+        pickle.loads(pickle.dumps(value, int(protocol)))
+    except Exception:  # whatever the value itself raises
+        return False
+    return True
+
+
+def _text(value: object) -> str:
+    """A value as a text of bounded length, whatever it is."""
+    try:
+        text = str(value)
+    except Exception:  # such as for an integer of more than 4300 digits
+        text = f"a value of type {type(value).__name__} that cannot be shown"
+    return text if len(text) <= _LONGEST_TEXT else f"{text[:_LONGEST_TEXT]}..."

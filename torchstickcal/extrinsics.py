@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import torch
 from kornia.geometry.camera import PinholeCamera
 from kornia.geometry.liegroup import Se3
 from torch import Tensor, nn
 
+from torchstickcal.arrays import tensor_of
 from torchstickcal.errors import ObservationError
+from torchstickcal.precision import full_precision, in_common_precision
 
 
 class Extrinsics(nn.Module):
@@ -15,13 +19,14 @@ class Extrinsics(nn.Module):
 
     The tangents are ordered (translation, rotation) and act on the world's side of the transform. They start at zero, and any
     optimiser of torch.optim can change them. :meth:`reanchor` moves the anchor to the present transforms when they have grown.
+    Transforms are in float32 or float64 and are computed so, also in an autocast region.
 
     Args:
-        rotations: (C, 3, 3), world to camera.
+        rotations: (C, 3, 3), world to camera, as a tensor, array or list; so are the translations.
         translations: (C, 3), world to camera, metres.
 
     Raises:
-        ObservationError: if the shapes do not fit.
+        ObservationError: if they are not numbers, or their shapes do not fit.
 
     Example:
         >>> import torch
@@ -37,24 +42,28 @@ class Extrinsics(nn.Module):
     anchor_rotations: Tensor
     anchor_translations: Tensor
 
-    def __init__(self, rotations: Tensor, translations: Tensor) -> None:
+    def __init__(self, rotations: Any, translations: Any) -> None:
         super().__init__()
-        if rotations.ndim != 3 or rotations.shape[1:] != (3, 3) or translations.shape != rotations.shape[:2]:
+        rotations = tensor_of(rotations, "rotations")
+        translations = tensor_of(translations, "translations", device=rotations.device)
+        fitting = rotations.ndim == 3 and rotations.shape[1:] == (3, 3) and translations.shape == rotations.shape[:2]
+        if not fitting or not len(rotations):
             raise ObservationError(
                 "poses have the wrong shape",
                 where="Extrinsics",
                 got=f"rotations {tuple(rotations.shape)}, translations {tuple(translations.shape)}",
                 expected="(C, 3, 3) and (C, 3)",
             )
-        self.register_buffer("anchor_rotations", rotations.detach().clone())
-        self.register_buffer("anchor_translations", translations.detach().clone())
+        rotations, translations = in_common_precision(rotations, translations)
+        self.register_buffer("anchor_rotations", rotations.clone())
+        self.register_buffer("anchor_translations", translations.clone())
         self.tangents = nn.Parameter(torch.zeros(len(rotations), 6, dtype=rotations.dtype, device=rotations.device))
 
     def forward(self) -> tuple[Tensor, Tensor]:
         """Rotations (C, 3, 3) and translations (C, 3), differentiable by the tangents of all cameras but the first."""
         moved = self.compose(self.tangents[1:])
-        rotations = torch.cat([self.anchor_rotations[:1], moved[0]])
-        return rotations, torch.cat([self.anchor_translations[:1], moved[1]])
+        rotations = torch.cat([self.anchor_rotations[:1].to(moved[0]), moved[0]])
+        return rotations, torch.cat([self.anchor_translations[:1].to(moved[1]), moved[1]])
 
     def to_kornia(self) -> Se3:
         """The C transforms, world to camera, as kornia's."""
@@ -71,10 +80,12 @@ class Extrinsics(nn.Module):
 
     def compose(self, tangents: Tensor) -> tuple[Tensor, Tensor]:
         """The poses of all cameras but the first at tangents (C - 1, 6) from the anchor."""
-        step = Se3.exp(tangents).matrix()
-        anchor = self.anchor_rotations[1:]
-        rotations = anchor @ step[:, :3, :3]
-        return rotations, (anchor @ step[:, :3, 3:])[..., 0] + self.anchor_translations[1:]
+        with full_precision(tangents.device):
+            tangents, anchor, translations = in_common_precision(
+                tangents, self.anchor_rotations[1:], self.anchor_translations[1:]
+            )
+            step = Se3.exp(tangents).matrix()
+            return anchor @ step[:, :3, :3], (anchor @ step[:, :3, 3:])[..., 0] + translations
 
     @torch.no_grad()
     def reanchor(self) -> None:

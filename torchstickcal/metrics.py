@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch import Tensor
 
+from torchstickcal.arrays import tensor_of
+from torchstickcal.errors import ObservationError
 from torchstickcal.geometry import se3
 
 _COLLINEAR = 1e-6
@@ -32,14 +35,32 @@ class PoseErrors:
         return float(self.translation_m.mean())
 
 
-def pose_errors(rotations: Tensor, translations: Tensor, true_rotations: Tensor, true_translations: Tensor) -> PoseErrors:
+def pose_errors(rotations: Any, translations: Any, true_rotations: Any, true_translations: Any) -> PoseErrors:
     """Errors of estimated poses (..., C, 3, 3), (..., C, 3), world to camera, against the true ones (C, 3, 3), (C, 3).
 
     The estimated camera centres are laid onto the true ones by the rotation and translation of least squares (Kabsch and
     Umeyama, no scale). Where the true centres lie on one line, as two cameras always do, they leave a rotation open, and
-    the first camera's pose serves for the alignment instead. Computed in float64.
+    the first camera's pose serves for the alignment instead. Computed in float64, of tensors, arrays or lists.
+
+    Raises:
+        ObservationError: if they are not numbers, or their shapes do not fit.
     """
-    r, t, r_true, t_true = (v.detach().double().cpu() for v in (rotations, translations, true_rotations, true_translations))
+    given = {
+        "rotations": rotations,
+        "translations": translations,
+        "true_rotations": true_rotations,
+        "true_translations": true_translations,
+    }
+    r, t, r_true, t_true = (tensor_of(value, name).double().cpu() for name, value in given.items())
+    cameras = len(r_true) if r_true.ndim else 0
+    expected = ((*r.shape[:-3], cameras, 3, 3), (*r.shape[:-3], cameras, 3), (cameras, 3, 3), (cameras, 3))
+    if not cameras or (r.shape, t.shape, r_true.shape, t_true.shape) != expected:
+        raise ObservationError(
+            "poses have the wrong shape",
+            where=", ".join(given),
+            got=", ".join(str(tuple(value.shape)) for value in (r, t, r_true, t_true)),
+            expected="(..., C, 3, 3), (..., C, 3), (C, 3, 3), (C, 3)",
+        )
     centres, true_centres = se3.camera_centres(r, t), se3.camera_centres(r_true, t_true)
     spread = torch.linalg.svdvals(true_centres - true_centres.mean(0))
     if spread[1] <= _COLLINEAR * spread[0]:

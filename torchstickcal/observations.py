@@ -2,17 +2,24 @@
 
 from __future__ import annotations
 
+import sys
+import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
-import numpy as np
 import torch
 from torch import Tensor
 
-from torchstickcal.errors import ObservationError
+from torchstickcal.arrays import FARTHEST_PX, is_too_far, names_of, number_of, tensor_of, truth_of
+from torchstickcal.errors import ObservationError, ObservationWarning
 from torchstickcal.geometry.cameras import Intrinsics
-from torchstickcal.stick import Stick, point_index
+from torchstickcal.stick import Stick, check_ends, located_sticks, point_index
+
+_COEFFICIENTS = (4, 5, 8, 12, 14)
+_FISHEYE_COEFFICIENTS = (4,)
+_LARGEST_INTRINSIC = 1e9
+"""Beyond any camera; squares of larger numbers may not be numbers at all."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -21,10 +28,11 @@ class Observations:
 
     Args:
         keypoints: pixels (C, F, P, 2) as detected (distorted), NaN where a point was not seen.
-        intrinsics: camera matrices, (C, 3, 3) or one (3, 3) for all; None if they are to be estimated, for which the image size
-            is needed. The principal point is then taken to be the centre of the image.
+        intrinsics: camera matrices, (C, 3, 3), or one (3, 3) or (1, 3, 3) for all; None if they are to be estimated, for which
+            the image size is needed. The principal point is then taken to be the centre of the image.
         sticks: one stick or several; empty if the scale comes from elsewhere.
-        distortion: (C, D) or (D,), OpenCV's order, D of 4, 5, 8, 12 or 14; None for perfect lenses.
+        distortion: (C, D), or one (D,) for all, OpenCV's order, D of 4, 5, 8, 12 or 14; None for perfect lenses. Rows and
+            columns as OpenCV returns them, (1, D), (D, 1), (C, 1, D) and (C, D, 1), are accepted too.
         confidence: (C, F, P) in [0, 1], the weight of a keypoint: its variance is divided by it. 0 means not seen.
         image_size: width and height in pixels, (C, 2) or (2,).
         fps: frames per second.
@@ -35,11 +43,17 @@ class Observations:
         readout_s: time from the first row of an image to the last, of rolling shutters, seconds; None for none. Needs image
             size and frame rate.
 
-    Arrays, lists and tensors are accepted and kept as tensors with the given values, shape and dtype. The results of a
-    calibration have the dtype and device of ``keypoints``.
+    Arrays, lists and tensors are accepted and kept as tensors with the given values. Those in float32 and float64 keep their
+    dtype; float16 and bfloat16 become float32, without loss, and integers and longer numbers float64. Masked values of numpy's
+    masked arrays count as NaN in ``keypoints`` and ``timestamps``, as 0 in ``confidence``, and are refused elsewhere. Tensors
+    that require gradients are detached: :func:`torchstickcal.calibrate` is not differentiable, while
+    :class:`torchstickcal.CalibrationLayer` is. The results of a calibration have the dtype and device of ``keypoints`` as kept.
 
     Raises:
         ObservationError: for anything that cannot be used.
+
+    Warns:
+        ObservationWarning: if keypoints lie exactly at (0, 0), by which many detectors mean "not seen".
 
     Example:
         >>> import numpy as np
@@ -88,27 +102,36 @@ class Observations:
         readout_s: float | None = None,
     ) -> None:
         put = object.__setattr__
-        put(self, "keypoints", _tensor(keypoints, "keypoints"))
-        device = self.keypoints.device
-        put(self, "intrinsics_known", intrinsics_known and intrinsics is not None)
-        put(self, "intrinsics", _tensor(_guess(image_size) if intrinsics is None else intrinsics, "intrinsics", device))
-        for name, value in (("distortion", distortion), ("confidence", confidence), ("image_size", image_size)):
-            put(self, name, None if value is None else _tensor(value, name, device))
-        put(self, "fps", None if fps is None else float(fps))
-        put(self, "timestamps", None if timestamps is None else _times(timestamps, self.keypoints))
-        put(self, "readout_s", None if readout_s is None else float(readout_s))
-        put(self, "point_names", None if point_names is None else tuple(map(str, point_names)))
-        put(self, "camera_names", None if camera_names is None else tuple(map(str, camera_names)))
-        put(self, "fisheye", bool(fisheye))
-        put(self, "sticks", _located((sticks,) if isinstance(sticks, Stick) else tuple(sticks), self.point_names))
+        put(self, "keypoints", tensor_of(keypoints, "keypoints", masked=torch.nan))
         self._check_keypoints()
+        device = self.keypoints.device
+        put(self, "image_size", None if image_size is None else tensor_of(image_size, "image_size", device=device))
+        self._check_image_size()
+        put(self, "fisheye", truth_of(fisheye, "fisheye"))
+        put(self, "intrinsics_known", truth_of(intrinsics_known, "intrinsics_known") and intrinsics is not None)
+        matrix = _guess(self.image_size) if intrinsics is None else tensor_of(intrinsics, "intrinsics", device=device)
+        put(self, "intrinsics", matrix[0] if matrix.shape == (1, 3, 3) else matrix)
+        if distortion is not None:
+            distortion = coefficients_of(tensor_of(distortion, "distortion", device=device), self.fisheye)
+        put(self, "distortion", distortion)
         self._check_intrinsics()
+        if confidence is not None:
+            confidence = tensor_of(confidence, "confidence", device=device, masked=0.0)
+        put(self, "confidence", confidence)
         self._check_confidence()
-        self._check_names()
+        put(self, "point_names", names_of(point_names, "point_names", self.num_points))
+        put(self, "camera_names", names_of(camera_names, "camera_names", self.num_cameras))
+        put(self, "fps", None if fps is None else _frame_rate(fps))
+        put(self, "timestamps", None if timestamps is None else _times(timestamps, self.keypoints))
+        put(self, "readout_s", None if readout_s is None else _readout(readout_s))
         self._check_times()
         visible = self.keypoints.isfinite().all(-1)
         put(self, "visible", visible if self.confidence is None else visible & (self.confidence > 0))
+        put(self, "sticks", located_sticks(sticks, self.point_names))
         self._check_sticks()
+        if sys._getframe(1).f_globals.get("__name__") != "dataclasses":  # replace() changes what has been warned about
+            for sentence in self.warnings:
+                warnings.warn(sentence, ObservationWarning, stacklevel=2)
 
     @property
     def num_cameras(self) -> int:
@@ -131,7 +154,7 @@ class Observations:
         matrix = self.intrinsics.double().expand(self.num_cameras, 3, 3)
         if self.distortion is None or not bool((self.distortion != 0).any()):
             return Intrinsics(matrix, None, False)
-        distortion = self.distortion.double()
+        distortion = _without_zeros(self.distortion.double())
         return Intrinsics(matrix, distortion.expand(self.num_cameras, distortion.shape[-1]), self.fisheye)
 
     def camera_label(self, index: int) -> str:
@@ -154,6 +177,17 @@ class Observations:
             ObservationError: if no point has the name.
         """
         return point_index(name, self.point_names)
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """What is probably not meant as it was given."""
+        at_corner = int(((self.keypoints == 0).all(-1) & self.visible).sum())
+        if not at_corner:
+            return ()
+        return (
+            f"{at_corner} of {int(self.visible.sum())} keypoints lie exactly at (0, 0), the corner of the image, by which many "
+            "detectors mean that a point was not seen. They are used as given. Set them to NaN if they were not seen.",
+        )
 
     def to(self, device: torch.device | str) -> Observations:
         """The same observations on another device."""
@@ -184,8 +218,12 @@ class Observations:
             raise ObservationError(
                 "a rig needs at least two cameras", where="keypoints", got=f"{self.num_cameras} camera", expected="2 or more"
             )
-        if keypoints.isinf().any():
-            _refuse_first("keypoints hold infinite values", keypoints.isinf().any(-1), keypoints, "finite pixels or NaN")
+        if (far := is_too_far(keypoints)).any():
+            infinite = bool(keypoints.isinf().any())
+            what = "keypoints hold infinite values" if infinite else "keypoints lie outside any image"
+            _refuse_first(
+                what, keypoints.isinf().any(-1) if infinite else far, keypoints, f"at most {FARTHEST_PX:g} pixels, or NaN"
+            )
         half = keypoints.isnan().any(-1) & ~keypoints.isnan().all(-1)
         if half.any():
             _refuse_first("a keypoint has only one coordinate", half, keypoints, "both coordinates, or NaN for both")
@@ -200,7 +238,7 @@ class Observations:
                 expected=f"(3, 3) or ({cameras}, 3, 3)",
             )
         for index, camera in enumerate(matrix.reshape(-1, 3, 3)):
-            usable = camera.isfinite().all() and camera[0, 0] > 0 and camera[1, 1] > 0
+            usable = (camera.abs() <= _LARGEST_INTRINSIC).all() and (camera.diagonal() >= 1 / _LARGEST_INTRINSIC).all()
             if not (usable and camera[1, 0] == 0 and bool((camera[2] == camera.new_tensor([0, 0, 1])).all())):
                 raise ObservationError(
                     "a camera matrix is not invertible or not a camera matrix",
@@ -209,26 +247,27 @@ class Observations:
                     expected="[[fx, s, cx], [0, fy, cy], [0, 0, 1]] with fx, fy > 0, in pixels",
                 )
         if self.distortion is not None:
-            counts = (4,) if self.fisheye else (4, 5, 8, 12, 14)
             shape = tuple(self.distortion.shape)
-            if shape[-1:] not in {(n,) for n in counts} or shape[:-1] not in {(), (cameras,)}:
+            if shape[:-1] not in {(), (cameras,)}:
+                expected = f"({cameras}, D) or (D,)"
+                raise ObservationError("distortion has the wrong shape", where="distortion", got=shape, expected=expected)
+            if not (self.distortion.abs() <= _LARGEST_INTRINSIC).all():
                 raise ObservationError(
-                    "distortion has the wrong shape",
+                    "distortion is not finite",
                     where="distortion",
-                    got=shape,
-                    expected=f"({cameras}, D) or (D,), D of {', '.join(map(str, counts))}",
+                    got=self.distortion.tolist(),
+                    expected=f"finite numbers, at most {_LARGEST_INTRINSIC:g}",
                 )
-            if not self.distortion.isfinite().all():
-                raise ObservationError(
-                    "distortion is not finite", where="distortion", got=self.distortion.tolist(), expected="finite numbers"
-                )
-        if self.image_size is not None and (
-            tuple(self.image_size.shape) not in {(2,), (cameras, 2)} or not bool((self.image_size > 0).all())
+
+    def _check_image_size(self) -> None:
+        size, cameras = self.image_size, self.num_cameras
+        if size is not None and (
+            tuple(size.shape) not in {(2,), (cameras, 2)} or not bool(((size > 0) & (size <= FARTHEST_PX)).all())
         ):
             raise ObservationError(
                 "image size is not usable",
                 where="image_size",
-                got=self.image_size.tolist(),
+                got=size.tolist(),
                 expected=f"(2,) or ({cameras}, 2): width, height in pixels",
             )
 
@@ -245,21 +284,16 @@ class Observations:
             )
         outside = ~((confidence >= 0) & (confidence <= 1)) & ~self.keypoints.isnan().all(-1)
         if outside.any():
-            _refuse_first("confidence outside [0, 1]", outside, confidence, "a number from 0 to 1", where="confidence")
-
-    def _check_names(self) -> None:
-        for where, names, count in (
-            ("point_names", self.point_names, self.num_points),
-            ("camera_names", self.camera_names, self.num_cameras),
-        ):
-            if names is not None and (len(names) != count or len(set(names)) != count):
-                raise ObservationError(
-                    "names do not fit the keypoints", where=where, got=names, expected=f"{count} different names"
-                )
+            _refuse_first(
+                "confidence outside [0, 1]",
+                outside,
+                confidence,
+                "a number from 0 to 1",
+                where="confidence",
+                remedy="Divide the scores of a heat map by the largest possible score, or clip them to [0, 1]; 0 is not seen.",
+            )
 
     def _check_times(self) -> None:
-        if self.fps is not None and not (np.isfinite(self.fps) and self.fps > 0):
-            raise ObservationError("frame rate is not usable", where="fps", got=self.fps, expected="a number above 0")
         if self.timestamps is not None:
             shape = tuple(self.keypoints.shape[:2])
             if tuple(self.timestamps.shape) != shape:
@@ -281,34 +315,21 @@ class Observations:
             unplaced = self.timestamps.isnan()[..., None] & self.keypoints.isfinite().all(-1)
             if unplaced.any():
                 _refuse_first("a keypoint in a frame without a timestamp", unplaced, self.keypoints, "a time, or NaN keypoints")
-        if self.readout_s is not None:
-            if not (np.isfinite(self.readout_s) and self.readout_s >= 0):
-                raise ObservationError(
-                    "not a read-out time", where="readout_s", got=self.readout_s, expected="seconds, 0 or more"
-                )
-            if self.image_size is None or (self.fps is None and self.timestamps is None):
-                raise ObservationError(
-                    "a read-out time without what it is counted in",
-                    where="readout_s",
-                    got=f"image_size {self.image_size}, fps {self.fps}",
-                    expected="image_size, and fps or timestamps",
-                )
+        if self.readout_s is not None and (self.image_size is None or (self.fps is None and self.timestamps is None)):
+            raise ObservationError(
+                "a read-out time without what it is counted in",
+                where="readout_s",
+                got=f"image_size {self.image_size}, fps {self.fps}",
+                expected="image_size, and fps or timestamps",
+            )
 
     def _check_sticks(self) -> None:
+        check_ends(self.sticks, self.num_points)
         views = self.visible.sum(0)
+        if not views.any():
+            return
         for number, stick in enumerate(self.sticks):
             where, (start, end) = f"sticks[{number}]", stick.ends
-            if not (0 <= start < self.num_points and 0 <= end < self.num_points):
-                raise ObservationError(
-                    "a stick's end is not a tracked point",
-                    where=where,
-                    got=f"start {start}, end {end}",
-                    expected=f"indices from 0 to {self.num_points - 1}",
-                )
-            if any({start, end} == set(other.ends) for other in self.sticks[:number]):
-                raise ObservationError(
-                    "two sticks have the same ends", where=where, got=f"start {start}, end {end}", expected="a stick once"
-                )
             if not bool(((views[:, start] >= 2) & (views[:, end] >= 2)).any()):
                 raise ObservationError(
                     "a stick is never seen by two cameras",
@@ -320,53 +341,88 @@ class Observations:
                 )
 
 
-def _located(sticks: Sequence[Any], point_names: Sequence[str] | None) -> tuple[Stick, ...]:
-    """Sticks with their ends as indices of points."""
-    for number, stick in enumerate(sticks):
-        if not isinstance(stick, Stick):
-            expected = "Stick(start, end, length_m)"
-            raise ObservationError("not a stick", where=f"sticks[{number}]", got=repr(stick), expected=expected)
-    return tuple(stick.located(point_names) for stick in sticks)
+def coefficients_of(distortion: Tensor, fisheye: bool) -> Tensor | None:
+    """Lens coefficients (..., D), where rows or columns of OpenCV's were given; None for no coefficients.
+
+    Raises:
+        ObservationError: if their number is none of OpenCV's.
+    """
+    counts = _FISHEYE_COEFFICIENTS if fisheye else _COEFFICIENTS
+    given = tuple(distortion.shape)
+    if distortion.ndim > 1 and given[-1] == 1:
+        distortion = distortion[..., 0]
+    if distortion.ndim == 3 and distortion.shape[1] == 1:
+        distortion = distortion[:, 0]
+    if distortion.ndim == 2 and len(distortion) == 1:
+        distortion = distortion[0]
+    if distortion.shape[-1:] == (0,):
+        return None
+    if distortion.shape[-1:] not in {(n,) for n in counts}:
+        expected = f"(cameras, D) or (D,), D of {', '.join(map(str, counts))}"
+        raise ObservationError("distortion has the wrong shape", where="distortion", got=given, expected=expected)
+    return distortion
 
 
-def _tensor(value: Any, name: str, device: torch.device | None = None) -> Tensor:
-    try:
-        tensor = value if isinstance(value, Tensor) else torch.as_tensor(np.asarray(value))
-    except (TypeError, ValueError) as error:
-        raise ObservationError("not an array of numbers", where=name, got=type(value).__name__, expected="numbers") from error
-    if tensor.is_complex() or tensor.dtype == torch.bool:
-        raise ObservationError("not an array of real numbers", where=name, got=tensor.dtype, expected="real numbers")
-    return tensor.to(device=device, dtype=tensor.dtype if tensor.is_floating_point() else torch.float64)
+def _without_zeros(distortion: Tensor) -> Tensor:
+    """Distortion (..., D) without the tilt of the sensor and the thin prism, of every lens, where they are zero."""
+    for shorter in (12, 8):
+        if distortion.shape[-1] > shorter and not bool(distortion[..., shorter:].any()):
+            distortion = distortion[..., :shorter]
+    return distortion
+
+
+def _frame_rate(fps: Any) -> float:
+    return number_of(
+        fps,
+        "fps",
+        what="frame rate is not usable",
+        expected="one number above 0, frames per second",
+        least=1e-6,
+        most=1e7,
+        several="Where cameras have frame rates of their own, give timestamps instead.",
+    )
+
+
+def _readout(readout_s: Any) -> float:
+    return number_of(
+        readout_s,
+        "readout_s",
+        what="not a read-out time",
+        expected="one number for all cameras, seconds, 0 or more",
+        least=0.0,
+        most=10.0,
+        several="Where they differ, give the timestamps of the middle rows instead, or estimate them (refine 'readout').",
+    )
 
 
 def _times(timestamps: Any, keypoints: Tensor) -> Tensor:
     """Timestamps (C, F), of those of each camera or of those common to all (F,)."""
-    times = _tensor(timestamps, "timestamps", keypoints.device)
+    times = tensor_of(timestamps, "timestamps", device=keypoints.device, masked=torch.nan)
     return times.expand(len(keypoints), -1) if times.ndim == 1 else times
 
 
-def _guess(image_size: Any) -> Tensor:
+def _guess(size: Tensor | None) -> Tensor:
     """Camera matrices (..., 3, 3) of images (..., 2): the centre, and a focal length as long as the wider side.
 
     Raises:
         ObservationError: if there is no image size.
     """
-    if image_size is None:
+    if size is None:
         raise ObservationError(
             "neither intrinsics nor image size", where="intrinsics", got="None", expected="camera matrices, or image_size"
         )
-    size = _tensor(image_size, "image_size")
-    matrix = torch.eye(3, dtype=torch.float64).repeat(*size.shape[:-1], 1, 1)
+    matrix = torch.eye(3, dtype=torch.float64, device=size.device).repeat(*size.shape[:-1], 1, 1)
     matrix[..., :2, 2] = (size - 1) / 2
     matrix[..., [0, 1], [0, 1]] = size.amax(-1, keepdim=True).to(matrix)
     return matrix
 
 
-def _refuse_first(what: str, bad: Tensor, values: Tensor, expected: str, where: str = "keypoints") -> None:
+def _refuse_first(what: str, bad: Tensor, values: Tensor, expected: str, where: str = "keypoints", remedy: str = "") -> None:
     camera, frame, point = (int(i) for i in bad.nonzero()[0])
     raise ObservationError(
         what,
         where=f"{where}[{camera}, {frame}, {point}]",
         got=f"{values[camera, frame, point].tolist()} ({int(bad.sum())} such in all)",
         expected=expected,
+        remedy=remedy,
     )

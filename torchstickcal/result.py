@@ -14,7 +14,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchstickcal.errors import FileFormatError
+from torchstickcal.arrays import FARTHEST_PX, number_of, tensor_of
+from torchstickcal.errors import FileFormatError, ObservationError
 from torchstickcal.files import atomic_path
 from torchstickcal.geometry import se3
 from torchstickcal.geometry.cameras import Intrinsics
@@ -198,19 +199,32 @@ class Calibration:
         found = self._point_covariances(self.points.double().flatten(0, 1), seen.flatten(1), sigma_px)
         return found.diagonal(dim1=1, dim2=2).sum(1).sqrt().to(self.points.dtype).view(frames, points)
 
-    def predict_std(self, points: Tensor, sigma_px: float | None = None) -> Tensor:
+    def predict_std(self, points: Any, sigma_px: float | None = None) -> Tensor:
         """How precisely points would be triangulated: standard deviations (..., 3) along the axes, metres.
 
         A point counts as seen by every camera in front of which it lies and, where the image sizes are known, in whose image.
 
         Args:
-            points: (..., 3), metres, in the frame of the first camera.
+            points: (..., 3), metres, in the frame of the first camera, as a tensor, array or list.
             sigma_px: noise of their keypoints along an axis, pixels; None for the median over the calibration's points.
 
         Returns:
-            Standard deviations, the uncertainty of the cameras included; NaN where fewer than two cameras see the point.
+            Standard deviations, the uncertainty of the cameras included; NaN where fewer than two cameras see the point. They
+            are in float32 or float64, as the points are.
+
+        Raises:
+            ObservationError: if the points are no points, or ``sigma_px`` is no number above 0.
         """
-        flat = points.detach().double().reshape(-1, 3).to(self.points.device)
+        points = tensor_of(points, "points", device=self.points.device)
+        if points.shape[-1:] != (3,):
+            got = tuple(points.shape)
+            raise ObservationError("points have the wrong shape", where="points", got=got, expected="(..., 3), metres")
+        if sigma_px is not None:
+            expected = "one number above 0, pixels"
+            sigma_px = number_of(
+                sigma_px, "sigma_px", what="not the noise of a keypoint", expected=expected, least=1e-9, most=FARTHEST_PX
+            )
+        flat = points.double().reshape(-1, 3)
         moved = se3.moved(self.rotations.double()[None], self.translations.double()[None], flat.mT[None])[0]
         visible = moved[:, 2] > 0
         if self.image_size is not None:

@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
-import math
+import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
-from torchstickcal.errors import ObservationError
+from torchstickcal.arrays import index_of, items_of, name_of, number_of
+from torchstickcal.errors import ObservationError, quoted
 from torchstickcal.registry import suggestion
 
 _LONGEST_STICK_M = 10.0
+_SHORTEST_STICK_M = 1e-3
+_LEAST_SIGMA_M = 1e-9
 _SHORTEST_IN_MM = 300.0
 
 
@@ -25,7 +29,7 @@ class Stick:
             stands in for a stick is known to a few centimetres at best.
 
     Raises:
-        ObservationError: if the ends are the same, or the length or its deviation are no lengths in metres.
+        ObservationError: if the ends are no points or the same one, or the length or its deviation are no lengths in metres.
 
     Example:
         >>> Stick(19, 20, 1.0)
@@ -40,13 +44,26 @@ class Stick:
     sigma_m: float = 0.001
 
     def __post_init__(self) -> None:
+        for name in ("start", "end"):
+            object.__setattr__(self, name, _end_of(getattr(self, name), f"Stick.{name}"))
         if self.start == self.end:
             raise ObservationError(
                 "a stick needs two different ends", where="Stick", got=f"start = end = {self.start!r}", expected="two points"
             )
-        for name, value in (("length_m", self.length_m), ("sigma_m", self.sigma_m)):
-            if not (math.isfinite(value) and value > 0):
-                raise ObservationError("not a length", where=f"Stick.{name}", got=value, expected="metres, above 0")
+        for name, least, most in (
+            ("length_m", _SHORTEST_STICK_M, sys.float_info.max),
+            ("sigma_m", _LEAST_SIGMA_M, _LONGEST_STICK_M),
+        ):
+            length = number_of(
+                getattr(self, name),
+                f"Stick.{name}",
+                what="not a length",
+                expected=f"one number, metres, {least:g} to {_LONGEST_STICK_M:g}",
+                least=least,
+                most=most,
+                several="Give each stick its own Stick.",
+            )
+            object.__setattr__(self, name, length)
         if self.length_m > _LONGEST_STICK_M:
             unit, factor = ("millimetres", 1000) if self.length_m >= _SHORTEST_IN_MM else ("centimetres", 100)
             raise ObservationError(
@@ -91,3 +108,55 @@ def point_index(name: str, point_names: Sequence[str] | None) -> int:
         remedy = suggestion(name, point_names) if point_names else "Give point_names."
         raise ObservationError("no such point", where="point_names", got=repr(name), expected=known, remedy=remedy)
     return list(point_names).index(name)
+
+
+def located_sticks(sticks: Any, point_names: Sequence[str] | None) -> tuple[Stick, ...]:
+    """One stick or several, with their ends as indices of points.
+
+    Raises:
+        ObservationError: if they are no sticks, if an end is a name that no point has, or if two have the same ends.
+    """
+    expected = "Stick(start, end, length_m), or a list of them"
+    given = [sticks] if isinstance(sticks, Stick) else items_of(sticks)
+    if given is None:
+        remedy = "Give an empty list if the scale comes from elsewhere." if sticks is None else ""
+        raise ObservationError("not a stick", where="sticks", got=quoted(sticks), expected=expected, remedy=remedy)
+    located: list[Stick] = []
+    for number, stick in enumerate(given):
+        where = f"sticks[{number}]"
+        if not isinstance(stick, Stick):
+            raise ObservationError("not a stick", where=where, got=quoted(stick), expected=expected)
+        located.append(stick.located(point_names))
+        start, end = located[-1].ends
+        if any({start, end} == set(other.ends) for other in located[:-1]):
+            raise ObservationError(
+                "two sticks have the same ends", where=where, got=f"start {start}, end {end}", expected="a stick once"
+            )
+    return tuple(located)
+
+
+def check_ends(sticks: Sequence[Stick], points: int) -> None:
+    """Refuse sticks whose ends are not among so many points.
+
+    Raises:
+        ObservationError: if there is one.
+    """
+    for number, stick in enumerate(sticks):
+        start, end = stick.ends
+        if not (0 <= start < points and 0 <= end < points):
+            raise ObservationError(
+                "a stick's end is not a tracked point",
+                where=f"sticks[{number}]",
+                got=f"start {start}, end {end}",
+                expected=f"indices from 0 to {points - 1}",
+            )
+
+
+def _end_of(end: Any, where: str) -> int | str:
+    """A stick's end as a plain number or text."""
+    if isinstance(end, str):
+        return name_of(end)
+    index = index_of(end)
+    if index is None:
+        raise ObservationError("not a point", where=where, got=quoted(end), expected="the index or the name of one point")
+    return index

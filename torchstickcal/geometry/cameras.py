@@ -10,17 +10,19 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import torch
 from torch import Tensor
 
+from torchstickcal.arrays import tensor_of
 from torchstickcal.errors import ObservationError
+from torchstickcal.precision import at_least_float32
 
 if TYPE_CHECKING:
     from kornia.geometry.camera import PinholeCamera
 
-_MAX_INVERSE_DEPTH = 1e6
+_MIN_DEPTH = 1e-6
 _FOLD_SEARCH_RADIUS = 8.0
 _FOLD_SEARCH_STEPS = 4096
 _UNDISTORT_ITERATIONS = 50
@@ -94,9 +96,7 @@ class Intrinsics:
         """The cameras of one session as those of a batch of one."""
         return Intrinsics(self.matrix[None], None if self.distortion is None else self.distortion[None], self.fisheye)
 
-    def to_kornia(
-        self, image_size: Tensor, rotations: Tensor | None = None, translations: Tensor | None = None
-    ) -> PinholeCamera:
+    def to_kornia(self, image_size: Any, rotations: Tensor | None = None, translations: Tensor | None = None) -> PinholeCamera:
         """The C cameras of one session as kornia's.
 
         Args:
@@ -105,7 +105,7 @@ class Intrinsics:
             translations: (C, 3), world to camera, metres; None for zero.
 
         Raises:
-            ObservationError: if the lenses are distorted, which kornia's camera cannot hold.
+            ObservationError: if the lenses are distorted, which kornia's camera cannot hold, or the image size is none.
 
         Example:
             >>> import torch
@@ -124,6 +124,10 @@ class Intrinsics:
                 expected="perfect lenses",
                 remedy="Undistort the keypoints (Intrinsics.undistort), then convert Intrinsics(matrix) without distortion.",
             )
+        size = tensor_of(image_size, "image_size").to(self.matrix)
+        if tuple(size.shape) not in {(2,), (len(self.matrix), 2)}:
+            expected = f"(2,) or ({len(self.matrix)}, 2): width, height in pixels"
+            raise ObservationError("image size is not usable", where="image_size", got=size.tolist(), expected=expected)
         matrix = torch.eye(4).to(self.matrix).repeat(len(self.matrix), 1, 1)
         pose = matrix.clone()
         matrix[:, :3, :3] = self.matrix
@@ -131,7 +135,7 @@ class Intrinsics:
             pose[:, :3, :3] = rotations
         if translations is not None:
             pose[:, :3, 3] = translations
-        width, height = image_size.to(self.matrix).expand(len(matrix), 2).unbind(-1)
+        width, height = size.expand(len(matrix), 2).unbind(-1)
         return PinholeCamera(matrix, pose, height, width)
 
     @staticmethod
@@ -146,7 +150,7 @@ class Intrinsics:
 
     def project(self, points_cam: Tensor) -> Tensor:
         """Pixels (..., C, ..., 2) of points (..., C, ..., 3) in the cameras' own frames, metres."""
-        return torch.stack(self.project_components(*points_cam.unbind(-1)), dim=-1)
+        return torch.stack(self.project_components(*at_least_float32(points_cam).unbind(-1)), dim=-1)
 
     def project_components(self, x: Tensor, y: Tensor, z: Tensor) -> tuple[Tensor, Tensor]:
         """Pixel coordinates of points given as three tensors (..., C, ...)."""
@@ -279,6 +283,7 @@ class Intrinsics:
         NaN where the pixel is NaN and where no point in front of the lens maps to it: beyond the radius at which the
         lens model folds back.
         """
+        pixels = at_least_float32(pixels)
         fx, skew, cx, fy, cy = self._pixel_map(pixels.ndim - 1)
         v_target = (pixels[..., 1] - cy) / fy
         u_target = (pixels[..., 0] - cx - skew * v_target) / fx
@@ -385,7 +390,12 @@ class Intrinsics:
 
 def inverse_depths(depth: Tensor) -> Tensor:
     """1 / z, bounded where z is nearly 0."""
-    return depth.reciprocal().clamp(-_MAX_INVERSE_DEPTH, _MAX_INVERSE_DEPTH)
+    return away_from_zero(depth).reciprocal()
+
+
+def away_from_zero(depth: Tensor) -> Tensor:
+    """Depths, those nearly 0 moved to the least by which one can divide, with gradient 0."""
+    return depth.abs().clamp_min(_MIN_DEPTH).copysign(depth)
 
 
 def _broadcast(per_camera: Tensor, ndim: int) -> Tensor:

@@ -9,7 +9,11 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from torchstickcal.geometry.cameras import Intrinsics
+from torchstickcal.geometry.cameras import Intrinsics, away_from_zero
+
+_WIDEST = 20.0
+"""Distance from the axis, in normalised coordinates, up to which the powers of OpenCV's standard lens model fit into
+float32. No lens sees as far."""
 
 
 def to_cameras(points: Tensor, rotations: Tensor, translations: Tensor) -> Tensor:
@@ -25,20 +29,32 @@ def to_cameras(points: Tensor, rotations: Tensor, translations: Tensor) -> Tenso
 
 
 def project(points_cam: Tensor, cameras: Intrinsics) -> Tensor:
-    """Pixels (..., C, n, 2), distorted by the lenses, of points (..., C, n, 3) in the cameras' frames, metres."""
+    """Pixels (..., C, n, 2), distorted by the lenses, of points (..., C, n, 3) in the cameras' frames, metres.
+
+    Pixels and their gradients are finite for every point, also beside and behind a camera and in its centre.
+    """
     from kornia.geometry.calibration import distort_points
-    from kornia.geometry.camera import distort_points_kannala_brandt, project_points_z1
+    from kornia.geometry.camera import distort_points_kannala_brandt
     from kornia.geometry.conversions import denormalize_points_with_intrinsics
 
-    normalised, matrix, distortion = project_points_z1(points_cam), cameras.matrix, cameras.distortion
+    normalised = points_cam[..., :2] / away_from_zero(points_cam[..., 2:])
+    matrix, distortion = cameras.matrix, cameras.distortion
     if distortion is None:
         pixels = denormalize_points_with_intrinsics(normalised, matrix)
     elif cameras.fisheye:
         pinhole = torch.cat([matrix[..., [0, 1], [0, 1]], matrix[..., :2, 2]], dim=-1)
         pixels = distort_points_kannala_brandt(normalised, torch.cat([pinhole, distortion], dim=-1).unsqueeze(-2))
     else:
-        pixels = distort_points(normalised, matrix, distortion, new_K=torch.eye(3).to(normalised))
+        pixels = distort_points(_limited(normalised), matrix, distortion, new_K=torch.eye(3).to(normalised))
     return _with_skew(pixels, matrix)
+
+
+def _limited(normalised: Tensor) -> Tensor:
+    """Normalised coordinates (..., 2), in float32 drawn in towards the axis where they are farther from it than lenses see."""
+    if normalised.dtype != torch.float32:
+        return normalised
+    excess = normalised.square().sum(-1, keepdim=True) / _WIDEST**2
+    return normalised * excess.clamp_min(1.0).rsqrt()
 
 
 def _with_skew(pixels: Tensor, matrix: Tensor) -> Tensor:

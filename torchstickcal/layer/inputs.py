@@ -4,16 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import torch
 from torch import Tensor
 
+from torchstickcal.arrays import names_of, tensor_of, truth_of
 from torchstickcal.errors import ObservationError
 from torchstickcal.geometry.cameras import Intrinsics
 from torchstickcal.model.measurements import Measurements
 from torchstickcal.model.unknowns import RigUnknowns
-from torchstickcal.observations import Observations
-from torchstickcal.stick import Stick
+from torchstickcal.observations import Observations, coefficients_of
+from torchstickcal.stick import Stick, check_ends
 
 
 @dataclass(frozen=True)
@@ -21,7 +23,7 @@ class LayerInputs:
     """Arguments of a forward pass on B sessions of C cameras, F frames, P points and S sticks."""
 
     keypoints: Tensor
-    """(B, C, F, P, 2), pixels, NaN where not seen"""
+    """(B, C, F, P, 2), float32 or float64, pixels, NaN where not seen"""
     confidence: Tensor | None
     """(B, C, F, P)"""
     cameras: Intrinsics
@@ -36,43 +38,52 @@ class LayerInputs:
     @staticmethod
     def of(
         keypoints: Tensor,
-        intrinsics: Tensor | Intrinsics,
-        stick_lengths: Tensor | None,
-        confidence: Tensor | None,
-        image_size: Tensor | Sequence[int] | None,
+        intrinsics: Any,
+        stick_lengths: Any,
+        confidence: Any,
+        image_size: Any,
         sticks: Sequence[Stick],
         point_names: Sequence[str] | None,
     ) -> LayerInputs:
         """Arguments with keypoints (B, C, F, P, 2), the others broadcast to as many sessions and cameras.
 
         Raises:
-            ObservationError: if their shapes do not fit.
+            ObservationError: if they are no arrays, or their shapes do not fit.
         """
-        if keypoints.ndim != 5 or keypoints.shape[-1] != 2:
+        if keypoints.ndim != 5 or keypoints.shape[-1] != 2 or 0 in keypoints.shape[2:] or keypoints.shape[1] < 2:
             raise ObservationError(
                 "keypoints have the wrong shape",
                 where="keypoints",
                 got=tuple(keypoints.shape),
-                expected="(B, cameras, frames, points, 2) or (cameras, frames, points, 2)",
+                expected="(B, cameras, frames, points, 2) or (cameras, frames, points, 2), of two cameras or more",
             )
-        sessions, cameras = keypoints.shape[:2]
+        sessions, cameras, _, points, _ = keypoints.shape
+        check_ends(sticks, points)
         if stick_lengths is None:
-            stick_lengths = torch.tensor([stick.length_m for stick in sticks], dtype=torch.float64)
+            stick_lengths = [stick.length_m for stick in sticks]
         lens = intrinsics if isinstance(intrinsics, Intrinsics) else Intrinsics(intrinsics)
-        distortion = lens.distortion
+        fisheye, distortion = truth_of(lens.fisheye, "fisheye"), None
+        if lens.distortion is not None:
+            distortion = coefficients_of(tensor_of(lens.distortion, "distortion", keep_graph=True), fisheye)
         if distortion is not None:
             distortion = _expanded("distortion", distortion, (sessions, cameras, distortion.shape[-1]), keypoints)
         if image_size is not None:
-            image_size = _expanded("image_size", torch.as_tensor(image_size), (sessions, cameras, 2), keypoints)
+            image_size = _expanded("image_size", image_size, (sessions, cameras, 2), keypoints)
         return LayerInputs(
             keypoints,
-            None if confidence is None else confidence.reshape(keypoints.shape[:-1]),
-            Intrinsics(_expanded("intrinsics", lens.matrix, (sessions, cameras, 3, 3), keypoints), distortion, lens.fisheye),
+            None if confidence is None else _confidence(confidence, keypoints),
+            Intrinsics(_expanded("intrinsics", lens.matrix, (sessions, cameras, 3, 3), keypoints), distortion, fisheye),
             _expanded("stick_lengths", stick_lengths, (sessions, len(sticks)), keypoints),
             image_size,
             tuple(sticks),
-            None if point_names is None else tuple(point_names),
+            names_of(point_names, "point_names", points),
         )
+
+    def no_gradient(self) -> Tensor:
+        """Zero, through which a gradient of zero flows back to everything that was given."""
+        lens = self.cameras.distortion
+        given = (self.keypoints, self.confidence, self.cameras.matrix, lens, self.lengths_m)
+        return sum((tensor[..., :0].sum().double() for tensor in given if tensor is not None), self.lengths_m.new_zeros(()))
 
     def of_sessions(self, chosen: list[int]) -> LayerInputs:
         """Some of the sessions."""
@@ -86,19 +97,29 @@ class LayerInputs:
         )
 
     def observations(self, session: int) -> Observations:
-        """One session, without gradients."""
+        """One session, without gradients.
+
+        Raises:
+            ObservationError: if it cannot be used.
+        """
         distortion = self.cameras.distortion
         lengths = self.lengths_m[session].tolist()
-        return Observations(
-            self.keypoints[session].detach(),
-            self.cameras.matrix[session].detach(),
+        observations = Observations(
+            self.keypoints[session],
+            self.cameras.matrix[session],
             [replace(stick, length_m=length) for stick, length in zip(self.sticks, lengths, strict=True)],
-            distortion=None if distortion is None else distortion[session].detach(),
-            confidence=None if self.confidence is None else self.confidence[session].detach(),
-            image_size=None if self.image_size is None else self.image_size[session].detach(),
+            distortion=None if distortion is None else distortion[session],
+            confidence=None if self.confidence is None else self.confidence[session],
+            image_size=None if self.image_size is None else self.image_size[session],
             point_names=self.point_names,
             fisheye=self.cameras.fisheye,
         )
+        if not observations.visible.any():
+            expected = "points seen by two cameras or more"
+            raise ObservationError(
+                "points are never seen", where="keypoints", got="no keypoint that was seen", expected=expected
+            )
+        return observations
 
     def measurements(
         self, seen: Measurements, solved: Measurements, refined: Sequence[str], groups: Sequence[str]
@@ -139,14 +160,35 @@ class LayerInputs:
         )
 
 
-def _expanded(name: str, tensor: Tensor, shape: tuple[int, ...], like: Tensor) -> Tensor:
-    """A tensor in float64, expanded to a shape.
+def _confidence(value: Any, keypoints: Tensor) -> Tensor:
+    """One confidence per keypoint, (B, C, F, P).
 
     Raises:
-        ObservationError: if it does not fit.
+        ObservationError: if its shape does not fit.
     """
+    confidence, expected = (
+        tensor_of(value, "confidence", device=keypoints.device, masked=0.0, keep_graph=True),
+        keypoints.shape[:-1],
+    )
+    if confidence.shape not in (expected, expected[1:]):
+        raise ObservationError(
+            "confidence has the wrong shape",
+            where="confidence",
+            got=tuple(confidence.shape),
+            expected=f"{tuple(expected)} or {tuple(expected[1:])}, one per keypoint",
+        )
+    return confidence.expand(expected)
+
+
+def _expanded(name: str, value: Any, shape: tuple[int, ...], like: Tensor) -> Tensor:
+    """An array as a tensor in float64, expanded to a shape.
+
+    Raises:
+        ObservationError: if it is no array, or does not fit.
+    """
+    tensor = tensor_of(value, name, device=like.device, keep_graph=True).double()
     try:
-        return tensor.to(like.device, torch.float64).expand(shape)
+        return tensor.expand(shape)
     except RuntimeError as error:
         expected = f"{shape}, or fewer dimensions where all are alike"
         raise ObservationError("the wrong shape", where=name, got=tuple(tensor.shape), expected=expected) from error

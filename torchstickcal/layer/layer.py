@@ -8,11 +8,11 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from torch import Tensor, nn
+from torch import nn
 
+from torchstickcal.arrays import names_of, tensor_of
 from torchstickcal.config import Config, load_config
 from torchstickcal.errors import ConfigError, ObservationError, RigError
-from torchstickcal.geometry.cameras import Intrinsics
 from torchstickcal.layer.inputs import LayerInputs
 from torchstickcal.layer.result import LayerResult
 from torchstickcal.model.state import State
@@ -20,8 +20,9 @@ from torchstickcal.model.unknowns import RigUnknowns
 from torchstickcal.pipeline.adjust import Adjustment, adjust_cameras, adjust_points, begin
 from torchstickcal.pipeline.attach import attach_gradients
 from torchstickcal.pipeline.run import Run
+from torchstickcal.precision import full_precision
 from torchstickcal.solvers.gradients import GradientMode, gradient_mode
-from torchstickcal.stick import Stick
+from torchstickcal.stick import Stick, located_sticks
 from torchstickcal.workers import map_on_workers
 
 _KEYPOINTS_AT_ONCE = 32_000
@@ -46,7 +47,7 @@ class CalibrationLayer(nn.Module):
 
     Raises:
         ConfigError: if the configuration cannot be used, or leaves it to the data what is refined.
-        ObservationError: if a stick names a point that is not among ``point_names``.
+        ObservationError: if ``sticks`` are no sticks, or one names a point that is not among ``point_names``.
 
     Example:
         >>> from torchstickcal.simulate import golf_session
@@ -66,23 +67,25 @@ class CalibrationLayer(nn.Module):
         point_names: Sequence[str] | None = None,
     ) -> None:
         super().__init__()
-        self.point_names = None if point_names is None else tuple(point_names)
-        given = (sticks,) if isinstance(sticks, Stick) else tuple(sticks)
-        self.sticks = tuple(stick.located(self.point_names) for stick in given)
+        self.point_names = names_of(point_names, "point_names")
+        self.sticks = located_sticks(sticks, self.point_names)
         self.config = load_config(config)
         self._refined = _refined(self.config)
         self.gradient = gradient_mode(gradient)
 
     def forward(
         self,
-        keypoints: Tensor,
-        intrinsics: Tensor | Intrinsics,
-        stick_lengths: Tensor | None = None,
-        confidence: Tensor | None = None,
+        keypoints: Any,
+        intrinsics: Any,
+        stick_lengths: Any = None,
+        confidence: Any = None,
         initial: LayerResult | None = None,
-        image_size: Tensor | Sequence[int] | None = None,
+        image_size: Any = None,
     ) -> LayerResult:
-        """Calibrate B sessions of equal shape, or one.
+        """Calibrate B sessions of equal shape, or one. B may be 0.
+
+        Tensors, arrays and lists are accepted. Results have the dtype of ``keypoints``, but float32 for float16 and bfloat16,
+        and float64 for integers.
 
         Args:
             keypoints: (B, C, F, P, 2) or (C, F, P, 2), pixels, NaN where not seen.
@@ -95,9 +98,11 @@ class CalibrationLayer(nn.Module):
 
         Raises:
             ConfigError: if the configuration's camera groups do not fit the cameras.
-            ObservationError: for arguments whose shapes do not fit, and without an image size where it is needed. A session
-                that cannot be calibrated is not an error but a status.
+            ObservationError: for arguments that are no arrays, whose shapes do not fit, or that do not fit the sticks, and
+                without an image size where it is needed. A session that cannot be calibrated is not an error but a status,
+                and the gradients by what was given of it are zero.
         """
+        keypoints = tensor_of(keypoints, "keypoints", masked=torch.nan, keep_graph=True)
         batched = keypoints.ndim == 5
         if "readout" in self._refined and image_size is None:
             raise ObservationError(
@@ -112,7 +117,7 @@ class CalibrationLayer(nn.Module):
             initial = initial.each(lambda tensor: tensor[None])
         if initial is not None:
             self._check_initial(initial, given)
-        with torch.autocast(keypoints.device.type, enabled=False):
+        with full_precision(keypoints.device):
             result = self._calibrated(given, initial)
         return result if batched else result.each(lambda tensor: tensor[0])
 
@@ -130,7 +135,7 @@ class CalibrationLayer(nn.Module):
         starts = dict(enumerate(map_on_workers(device, begun, range(len(given.keypoints)))))
         failed = {session: start for session, start in starts.items() if isinstance(start, str)}
         going = {session: start for session, start in starts.items() if isinstance(start, Adjustment)}
-        together = len(going) if device.type != "cpu" else _KEYPOINTS_AT_ONCE // given.keypoints[0, ..., 0].numel()
+        together = len(going) if device.type != "cpu" else _KEYPOINTS_AT_ONCE // given.keypoints.shape[1:4].numel()
         chosen = [list(going)[first : first + max(1, together)] for first in range(0, len(going), max(1, together))]
 
         def solved(sessions: list[int]) -> LayerResult:
@@ -138,7 +143,8 @@ class CalibrationLayer(nn.Module):
             return self._solved(given.of_sessions(sessions), adjustment, run, only_last=initial is not None)
 
         results = map_on_workers(device, solved, chosen)
-        results += [self._failed(given.of_sessions([session]), status) for session, status in failed.items()]
+        if failed or not going:
+            results.append(self._failed(given.of_sessions(list(failed)), list(failed.values())))
         return LayerResult.together(results, [*itertools.chain(*chosen), *failed])
 
     def _solved(self, given: LayerInputs, begun: Adjustment, run: Run, only_last: bool) -> LayerResult:
@@ -150,14 +156,17 @@ class CalibrationLayer(nn.Module):
         status = tuple(ended.status(session) for session in range(data.sessions))
         return LayerResult.of(data, state, ended.last.inliers, ended.last.sigma_px, status, given.keypoints.dtype)
 
-    @torch.no_grad()
-    def _failed(self, given: LayerInputs, status: str) -> LayerResult:
-        """One session that could not be calibrated, and why: poses of nothing, cameras as given."""
-        data = given.unseen(self._refined, self.config.camera_groups)
-        poses = torch.eye(3).to(data.pixels).expand(1, data.num_cameras, 3, 3), data.pixels.new_zeros(1, data.num_cameras, 3)
-        state = State(*poses, data.pixels.new_zeros(1, 3, data.num_columns), data.unknowns.given)
-        sigma_px = data.pixels.new_zeros(1, data.points_per_frame)
-        return LayerResult.of(data, state, data.visible, sigma_px, (status,), given.keypoints.dtype)
+    def _failed(self, given: LayerInputs, status: Sequence[str]) -> LayerResult:
+        """Sessions that could not be calibrated, and why: poses of nothing, cameras as given, and gradients of zero."""
+        with torch.no_grad():
+            data = given.unseen(self._refined, self.config.camera_groups)
+            shape, zeros = (len(status), data.num_cameras), data.pixels.new_zeros
+            poses = torch.eye(3).to(data.pixels).expand(*shape, 3, 3), zeros(*shape, 3)
+            state = State(*poses, zeros(len(status), 3, data.num_columns), data.unknowns.given)
+            sigma_px = zeros(len(status), data.points_per_frame)
+            result = LayerResult.of(data, state, data.visible, sigma_px, status, given.keypoints.dtype)
+        no_gradient = given.no_gradient()
+        return result.each(lambda tensor: tensor + no_gradient if tensor.is_floating_point() else tensor)
 
     def _check_initial(self, initial: LayerResult, given: LayerInputs) -> None:
         """Refuse a start from another batch, or with other unknowns.

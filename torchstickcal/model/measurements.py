@@ -13,6 +13,7 @@ from functools import cached_property
 
 import torch
 from torch import Tensor
+from torch.nn.functional import pad
 
 from torchstickcal.geometry.cameras import Intrinsics
 from torchstickcal.model.state import State
@@ -90,11 +91,9 @@ class Measurements:
         if len(sessions) == 1:
             return sessions[0]
         first = sessions[0]
-        lenses = [session.cameras.distortion for session in sessions]
-        some = next((lens for lens in lenses if lens is not None), None)
         cameras = Intrinsics(
             torch.cat([session.cameras.matrix for session in sessions]),
-            None if some is None else torch.cat([torch.zeros_like(some) if lens is None else lens for lens in lenses]),
+            _lenses([session.cameras for session in sessions]),
             first.cameras.fisheye,
         )
         pixels, confidence, lengths_m = (
@@ -248,3 +247,11 @@ class Measurements:
     def by_frame(self, columns: Tensor) -> Tensor:
         """A tensor (..., N) as (..., F, P)."""
         return columns.unflatten(-1, (self.frames, -1))
+
+
+def _lenses(sessions: Sequence[Intrinsics]) -> Tensor | None:
+    """Coefficients (B, C, D) of sessions (1, C, ...), as many as the longest lens model has, the others zero; None for none."""
+    longest = max((cameras.distortion.shape[-1] for cameras in sessions if cameras.distortion is not None), default=0)
+    empty = sessions[0].matrix.new_zeros(*sessions[0].matrix.shape[:-2], 0)
+    given = [empty if cameras.distortion is None else cameras.distortion for cameras in sessions]
+    return torch.cat([pad(lens, (0, longest - lens.shape[-1])) for lens in given]) if longest else None

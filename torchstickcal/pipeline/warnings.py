@@ -36,7 +36,7 @@ def warnings_of(
         clocks: what a search for time offsets has found; None without one.
         unsynchronised: whether the motion contradicts the clocks, which were not estimated.
     """
-    found = _keypoints(ended) + _same_views(ended)
+    found = [*ended.observations[0].warnings, *_keypoints(ended), *_same_views(ended)]
     if len(ended.measurements.sticks) > 1:
         found += _contradicted_lengths(ended)
     for name, unknown in all_unknowns().items():
