@@ -12,7 +12,9 @@ import torchstickcal
 
 ROOT = Path(__file__).parents[1]
 FLOORS = [
-    ["errors", "files", "workers"],
+    ["errors", "workers", "lazy"],
+    ["files", "shapes"],
+    ["untrusted"],
     ["registry"],
     ["settings"],
     ["geometry"],

@@ -9,13 +9,13 @@ autograd, is :mod:`torchstickcal.geometry.projection`.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property
 from typing import TYPE_CHECKING, NamedTuple
 
 import torch
 from torch import Tensor
 
 from torchstickcal.errors import ObservationError
+from torchstickcal.lazy import cached_property
 
 if TYPE_CHECKING:
     from kornia.geometry.camera import PinholeCamera
