@@ -2,6 +2,6 @@
 
 import sys
 
-from torchstickcal.cli import main
+from torchstickcal.cli import program
 
-sys.exit(main())
+sys.exit(program())

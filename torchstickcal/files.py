@@ -110,8 +110,8 @@ def check_text(text: str, where: str) -> None:
         raise CalibrationError("a text that cannot be written", where=where, got=ascii(text), expected=expected) from error
 
 
-def json_text(content: Any) -> str:
-    """JSON with indentation, which every reader accepts: null in the place of NaN and infinities.
+def json_text(content: Any, indent: int | None = 2) -> str:
+    """JSON that every reader accepts: null in the place of NaN and infinities. On one line without an ``indent``.
 
     Example:
         >>> print(json_text({"mean_m": float("nan")}))
@@ -119,7 +119,7 @@ def json_text(content: Any) -> str:
           "mean_m": null
         }
     """
-    return json.dumps(_with_null(content), indent=2, allow_nan=False)
+    return json.dumps(_with_null(content), indent=indent, allow_nan=False)
 
 
 def parse_toml(content: bytes) -> dict[str, Any]:

@@ -280,7 +280,7 @@ class Calibration:
             if meta.pop("format") != _FORMAT:
                 raise KeyError("format of this version")
             tensors = {name: _tensor(arrays, name) for name in _TENSORS}
-            optional = {name: _tensor(arrays, name) if name in arrays else None for name in _OPTIONAL_TENSORS}
+            optional: dict[str, Any] = {name: _tensor(arrays, name) if name in arrays else None for name in _OPTIONAL_TENSORS}
             sizes = check_shapes("calibration", tensors | optional, _TENSORS | _OPTIONAL_TENSORS)
             unknowns = {name: _parameter(arrays, name, about, sizes["C"]) for name, about in meta["unknowns"].items()}
             calibration = Calibration(

@@ -4,17 +4,25 @@ from __future__ import annotations
 
 import argparse
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
 from torchstickcal.cli.benchmark import benchmark
 from torchstickcal.cli.calibrate import calibrate_session
 from torchstickcal.cli.evaluate import evaluate
 from torchstickcal.cli.listing import LISTS, list_names
+from torchstickcal.cli.outputs import EXIT_UNUSABLE
 from torchstickcal.cli.simulate import demo, simulate
 
 
+class _Parser(argparse.ArgumentParser):
+    """A parser whose errors are one line, as those of the commands."""
+
+    def error(self, message: str) -> NoReturn:
+        self.exit(EXIT_UNUSABLE, f"error: {' '.join(message.split())}; `{self.prog} --help` shows what there is\n")
+
+
 def parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
+    parser = _Parser(
         prog="torchstickcal",
         description="Calibrate a camera rig, in metres, from an athlete's keypoints and a stick of known length.",
     )

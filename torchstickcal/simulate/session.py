@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from torchstickcal.errors import FileFormatError
+from torchstickcal.errors import CalibrationError, FileFormatError
 from torchstickcal.io import Truth, read_npz, write_npz
 from torchstickcal.observations import Observations
 from torchstickcal.shapes import check_shapes
@@ -146,9 +146,11 @@ class SessionSpec:
         """Generate the session.
 
         Raises:
-            CalibrationError: for an unknown sport, path or layout, or an impossible number of cameras or height.
+            CalibrationError: for an unknown sport, path or layout, a negative seed, or an impossible number of cameras or height.
             ObservationError: if no frame is left in which two cameras see the stick.
         """
+        if self.seed < 0:
+            raise CalibrationError("negative seed", where="seed", got=self.seed, expected="0 or more")
         rng_rig, rng_clocks, rng_assumptions, rng_keypoints, rng_cube = np.random.default_rng(self.seed).spawn(5)
         motion = self.motion
         rig = camera_rig(self.layout, self.cameras, rng_rig, self.lens, self.radius_m)
