@@ -154,6 +154,10 @@ def _temporary_folder(folder: Path) -> Iterator[Path]:
     temporary = Path(tempfile.mkdtemp(dir=folder, prefix=_TEMPORARY))
     try:
         yield temporary
+    except OSError as error:
+        if error.errno is not None and error.filename is None:  # as of a full disk
+            raise OSError(error.errno, error.strerror, str(folder)) from error
+        raise
     finally:
         old = temporary / "old"
         if not old.is_dir() or not any(old.iterdir()):

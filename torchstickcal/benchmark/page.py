@@ -35,7 +35,7 @@ figure { margin: 1rem 0; } img { max-width: 100%; } code { background: #f0f2f4; 
 
 
 def write_results(rows: Sequence[Row], out: Path) -> None:
-    """Write ``results.csv``, ``results.json``, the figures, ``benchmark.md`` and ``benchmark.html``: all or none, into a folder."""
+    """Write ``results.csv``, ``results.json``, the figures, ``benchmark.md`` and ``benchmark.html``, all or none."""
     with atomic_set(out) as folder:
         _write_all(rows, folder)
 

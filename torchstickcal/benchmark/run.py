@@ -248,7 +248,8 @@ def _measured(
         return
     context = multiprocessing.get_context("spawn")
     parent, ours = context.Pipe(duplex=False)
-    with ProcessPoolExecutor(min(jobs, len(missing)), context, initializer=_start, initargs=(parent, prepare)) as pool, ours:
+    processes = min(jobs, len(missing))
+    with parent, ours, ProcessPoolExecutor(processes, context, initializer=_start, initargs=(parent, prepare)) as pool:
         with _without_interrupts():
             futures = [pool.submit(measure, place, source, name) for source, name in missing]
         try:

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import pickletools
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -86,7 +86,8 @@ class _Machine:
 
     def run(self, content: bytes) -> Any:
         stack = self._stack
-        for opcode, argument, _ in pickletools.genops(content):
+        operations: Iterator[tuple[Any, Any, Any]] = pickletools.genops(content)
+        for opcode, argument, _ in operations:
             name = opcode.name
             if name in _VALUES:
                 stack.append(argument)

@@ -13,7 +13,7 @@ from torchstickcal.result import Calibration, CameraParameter
 def table(calibration: Calibration) -> str:
     """The calibration as a text to print: cameras, sticks, stages."""
     cameras = zip(
-        calibration.camera_names,
+        map(printable, calibration.camera_names),
         calibration.camera_centres.tolist(),
         calibration.camera_std_m.tolist(),
         calibration.camera_std_deg.tolist(),
@@ -24,7 +24,7 @@ def table(calibration: Calibration) -> str:
     rows = [["camera", "centre x, y, z (m)", "+- mm", "+- deg", "reprojection (px)", "keypoints"]]
     rows += [
         [
-            printable(name),
+            name,
             " ".join(f"{v:8.4f}" for v in centre),
             f"{1000 * std_m:.2f}",
             f"{std_deg:.4f}",

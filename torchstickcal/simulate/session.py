@@ -146,7 +146,8 @@ class SessionSpec:
         """Generate the session.
 
         Raises:
-            CalibrationError: for an unknown sport, path or layout, a negative seed, or an impossible number of cameras or height.
+            CalibrationError: for an unknown sport, path or layout, a negative seed, or an impossible number of cameras or
+                height.
             ObservationError: if no frame is left in which two cameras see the stick.
         """
         if self.seed < 0:
