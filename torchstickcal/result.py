@@ -286,20 +286,22 @@ class Calibration:
             calibration = Calibration(
                 **tensors,
                 **optional,
-                fisheye=meta["fisheye"],
-                refined=tuple(meta["refined"]),
+                fisheye=_checked(meta["fisheye"], bool),
+                refined=_texts(meta["refined"]),
                 unknowns=unknowns,
                 sticks=tuple(Stick(*stick) for stick in meta["sticks"]),
-                fps=meta["fps"],
-                point_names=None if meta["point_names"] is None else tuple(meta["point_names"]),
-                camera_names=tuple(meta["camera_names"]),
-                stages=tuple(_stage_record(stage) for stage in meta["stages"]),
-                seconds=meta["seconds"],
-                warnings=tuple(meta["warnings"]),
+                fps=None if meta["fps"] is None else _number(meta["fps"]),
+                point_names=None if meta["point_names"] is None else _texts(meta["point_names"]),
+                camera_names=_texts(meta["camera_names"]),
+                stages=tuple(_stage_record(stage) for stage in _checked(meta["stages"], list)),
+                seconds=_numbers(meta["seconds"]),
+                warnings=_texts(meta["warnings"]),
             )
             counts = {"C": calibration.camera_names, "P": calibration.point_names, "S": calibration.sticks}
             if any(given is not None and len(given) != sizes[axis] for axis, given in counts.items()):
                 raise ValueError("names or sticks of another number of cameras, points or sticks")
+            if not calibration.stages or not all(stage.iterations for stage in calibration.stages):
+                raise ValueError("no stage, or one without iterations")
             if len(tensors["covariance"]) != 6 * (sizes["C"] - 1):
                 raise ValueError("a covariance of another number of cameras")
             return calibration
@@ -319,11 +321,48 @@ def _parameter(arrays: Mapping[str, Any], name: str, about: dict[str, Any], came
     if values.shape[:2] != (len(_PARAMETER_TENSORS), cameras):
         raise ValueError(f"{name} has the shape {tuple(values.shape)}")
     tensors = dict(zip(_PARAMETER_TENSORS, values, strict=True))
-    return CameraParameter(**about | {"components": tuple(about["components"])}, **tensors)
+    return CameraParameter(
+        _checked(about["label"], str),
+        _checked(about["unit"], str),
+        _texts(about["components"]),
+        _checked(about["refined"], bool),
+        **tensors,
+    )
 
 
 def _stage_record(stage: dict[str, Any]) -> StageRecord:
-    iterations = tuple(
-        IterationRecord(**record | {"reprojection_px": tuple(record["reprojection_px"])}) for record in stage["iterations"]
+    iterations = tuple(_iteration_record(record) for record in _checked(stage["iterations"], list))
+    return StageRecord(_checked(stage["name"], str), Stop[stage["stop"]], _number(stage["seconds"]), iterations)
+
+
+def _iteration_record(record: dict[str, Any]) -> IterationRecord:
+    return IterationRecord(
+        session=_checked(record["session"], int),
+        stage=_checked(record["stage"], str),
+        iteration=_checked(record["iteration"], int),
+        cost=_number(record["cost"]),
+        terms=_numbers(record["terms"]),
+        damping=_number(record["damping"]),
+        step_m=_number(record["step_m"]),
+        reprojection_px=tuple(map(_number, record["reprojection_px"])),
+        stick_length_m=_number(record["stick_length_m"]),
     )
-    return StageRecord(stage["name"], Stop[stage["stop"]], stage["seconds"], iterations)
+
+
+def _number(value: Any) -> float:
+    return _checked(value, int | float)
+
+
+def _numbers(values: Any) -> dict[str, float]:
+    return {name: _number(value) for name, value in _checked(values, dict).items()}
+
+
+def _texts(values: Any) -> tuple[str, ...]:
+    return tuple(_checked(value, str) for value in _checked(values, list))
+
+
+def _checked(value: Any, kind: Any) -> Any:
+    """A value of a file, which is of some type."""
+    if not isinstance(value, kind):
+        raise TypeError(f"{type(value).__name__} where {kind} is expected")
+    return value

@@ -80,7 +80,7 @@ def open_regular(path: str | Path) -> BinaryIO:
         raise
     except (OSError, ValueError) as error:
         got = f"{type(error).__name__}: {error}"
-        if Path(path).is_dir():
+        if os.path.isdir(path):  # noqa: PTH112 Path.is_dir raises for names that are too long
             raise _not_regular(path, "a folder") from error
         raise FileFormatError(
             "a file cannot be opened", where=str(path), got=got, expected="a file that can be read"

@@ -6,6 +6,7 @@ A new format is one decorated function, in a file of this folder or in a module 
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -340,7 +341,8 @@ def find_reader(path: str | Path, *registries: Registry[Any]) -> Reader[Any]:
         'read_npz'
     """
     path = Path(path)
-    head = b"" if path.is_dir() else read_head(path, HEAD_BYTES)
+    is_folder = os.path.isdir(path)  # noqa: PTH112 Path.is_dir raises for names that are too long
+    head = b"" if is_folder else read_head(path, HEAD_BYTES)
     for registry in registries:
         for reader in reversed(tuple(registry.values())):
             if reader.takes(path, head):
@@ -349,7 +351,7 @@ def find_reader(path: str | Path, *registries: Registry[Any]) -> Reader[Any]:
     raise FileFormatError(
         f"no {' or '.join(registry.kind for registry in registries)} is recognised",
         where=str(path),
-        got="a folder" if path.is_dir() else f"a file that starts with {head[:16]!r}" if head else "an empty file",
+        got="a folder" if is_folder else f"a file that starts with {head[:16]!r}" if head else "an empty file",
         expected=f"one of: {'; '.join(known)}",
         remedy="If it is one of these, give the name of the format.",
     )

@@ -25,6 +25,10 @@ _CODE = re.compile(r"[<>|=]?(?:[iuf]|c|b)(?:1|2|4|8|16)|\?")
 _PLAIN_STATE = (None, None, None, -1, -1, 0)
 """The state of such a type, after its version and its byte order."""
 _MARK = object()
+_SMALL = (int, float, bool, type(None))
+_SMALL_BYTES = 8
+"""What such a value needs in an array."""
+_CONTAINERS = (list, tuple, set, frozenset)
 _VALUES = {
     "BINFLOAT", "FLOAT", "INT", "BININT", "BININT1", "BININT2", "LONG", "LONG1", "LONG4",
     "UNICODE", "SHORT_BINUNICODE", "BINUNICODE", "BINUNICODE8", "STRING", "SHORT_BINSTRING", "BINSTRING",
@@ -185,7 +189,8 @@ _STEPS: dict[str, Callable[[_Machine, Any], None]] = {
 
 def _function(module: str, name: str) -> Any:
     """What stands in this machine for a function of NumPy or Python."""
-    found = _FUNCTIONS.get((_of_type(module, str).replace("numpy._core", "numpy.core"), _of_type(name, str)))
+    module = _of_type(module, str).replace("numpy._core", "numpy.core").replace("__builtin__", "builtins")
+    found = _FUNCTIONS.get((module, _of_type(name, str)))
     if found is None:
         raise ValueError(f"the file asks for {module}.{name}")
     return found
@@ -231,7 +236,19 @@ def _encoded(text: str, encoding: str) -> bytes:
     return _of_type(text, str).encode("latin-1")
 
 
-def _empty() -> dict[Any, Any]:
+def _set(values: Any) -> set[Any]:
+    return set(map(_key, _of_type(values, list)))
+
+
+def _frozenset(values: Any) -> frozenset[Any]:
+    return frozenset(_set(values))
+
+
+def _empty_bytes() -> bytes:
+    return b""
+
+
+def _empty_dictionary() -> dict[Any, Any]:
     return {}
 
 
@@ -245,10 +262,13 @@ _FUNCTIONS: dict[tuple[str, str], Callable[..., Any]] = {
     ("numpy.core.multiarray", "_reconstruct"): _reconstruct,
     ("numpy.core.multiarray", "scalar"): _scalar,
     ("numpy.core.numeric", "_frombuffer"): _array,
-    ("collections", "OrderedDict"): _empty,
+    ("builtins", "bytes"): _empty_bytes,
+    ("builtins", "set"): _set,
+    ("builtins", "frozenset"): _frozenset,
+    ("collections", "OrderedDict"): _empty_dictionary,
     ("_codecs", "encode"): _encoded,
 }
-"""By their modules and names, what stands for the functions with which NumPy rebuilds arrays."""
+"""By their modules and names, what stands for the functions with which NumPy and Python rebuild plain data."""
 
 
 def _of_type(value: Any, kind: Any) -> Any:
@@ -269,39 +289,32 @@ def _pairs(values: list[Any]) -> list[tuple[Any, Any]]:
 def _check_size(content: Any, most_bytes: int) -> None:
     """Refuse content that would need too much memory with everything that it repeats written out, or that holds itself."""
     sizes: dict[int, int] = {}
-    open_ones: set[int] = set()
+    begun: set[int] = set()
     waiting = [content]
     while waiting:
         value = waiting[-1]
-        children = _children(value)
-        if id(value) in sizes or not children:
-            sizes.setdefault(id(value), _own_size(value))
-            waiting.pop()
-        elif id(value) not in open_ones:
-            open_ones.add(id(value))
-            unknown = [child for child in children if id(child) not in sizes]
-            if any(id(child) in open_ones for child in unknown):
+        held = value.values() if isinstance(value, dict) else value if isinstance(value, _CONTAINERS) else ()
+        inner = [one for one in held if type(one) not in _SMALL]
+        unknown = [one for one in inner if id(one) not in sizes]
+        if id(value) not in sizes and unknown:
+            if any(id(one) in begun for one in (value, *unknown)):
                 raise ValueError("a list that holds itself")
+            begun.add(id(value))
             waiting += unknown
         else:
-            sizes[id(value)] = _own_size(value) + sum(sizes[id(child)] for child in children)
+            small_bytes = _SMALL_BYTES * (len(held) - len(inner))
+            sizes[id(value)] = _own_size(value) + small_bytes + sum(sizes[id(one)] for one in inner)
             waiting.pop()
     if sizes[id(content)] > most_bytes:
         raise ValueError(f"written out, the content needs {sizes[id(content)]} bytes")
 
 
-def _children(value: Any) -> list[Any]:
-    if isinstance(value, dict):
-        return list(value.values())
-    return list(value) if isinstance(value, list | tuple | set | frozenset) else []
-
-
 def _own_size(value: Any) -> int:
-    """The size of a value without what it holds, bytes."""
+    """What a value needs without what it holds, bytes."""
     if isinstance(value, np.ndarray):
         return value.nbytes
     if isinstance(value, str | bytes | bytearray):
         return len(value)
-    if isinstance(value, int | float | np.generic | list | tuple | set | frozenset | dict | None):
-        return 8
+    if isinstance(value, (*_SMALL, *_CONTAINERS, dict, np.generic)):
+        return _SMALL_BYTES
     raise ValueError(f"{type(value).__name__} where plain data is expected")
