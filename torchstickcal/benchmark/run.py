@@ -249,16 +249,17 @@ def _measured(
     context = multiprocessing.get_context("spawn")
     parent, ours = context.Pipe(duplex=False)
     processes = min(jobs, len(missing))
-    with parent, ours, ProcessPoolExecutor(processes, context, initializer=_start, initargs=(parent, prepare)) as pool:
-        with _without_interrupts():
-            futures = [pool.submit(measure, place, source, name) for source, name in missing]
+    pool = ProcessPoolExecutor(processes, context, initializer=_start, initargs=(parent, prepare))
+    with parent, ours:
         try:
+            with _without_interrupts():
+                futures = [pool.submit(measure, place, source, name) for source, name in missing]
             for future in as_completed(futures):
                 yield future.result()
         except BaseException:
-            ours.close()
-            pool.shutdown(cancel_futures=True)
+            pool.shutdown(wait=False, cancel_futures=True)  # its processes end because `ours` is closed
             raise
+        pool.shutdown()
 
 
 @contextmanager
