@@ -388,8 +388,7 @@ def test_processes_end_with_the_one_that_started_them(tmp_path: Path):
         assert parent.poll() is None
         time.sleep(0.1)
     parent.kill()
-    _, error = parent.communicate(timeout=20)  # ends when every process that can write to it has ended
-    assert error == b""
+    parent.communicate(timeout=20)  # ends when every process that can write to the pipe has ended
 
 
 def test_a_preset_is_scored(capsys: pytest.CaptureFixture[str]):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import faulthandler
 import multiprocessing
 import os
 import subprocess
@@ -60,15 +61,15 @@ def test_a_forked_process_has_its_own_workers():
 
 
 def _calibrate_in_child(seconds: float) -> None:
-    threading.Timer(seconds, os._exit, (1,)).start()
-    os._exit(0 if calibrate(golf_session(cameras=3, frames=8)[0], "stick_only").converged else 2)
+    faulthandler.dump_traceback_later(seconds, exit=True)
+    os._exit(0 if calibrate(golf_session(cameras=3, frames=10)[0]).converged else 2)
 
 
 @pytest.mark.skipif("fork" not in multiprocessing.get_all_start_methods(), reason="the system cannot fork")
 @pytest.mark.filterwarnings("ignore::DeprecationWarning")
 def test_processes_forked_during_calibrations_can_calibrate():
     """Whatever lock another thread holds at that moment."""
-    observations, stop = golf_session(cameras=3, frames=8)[0], threading.Event()
+    observations, stop = golf_session(cameras=3, frames=10)[0], threading.Event()
 
     def calibrate_again_and_again() -> None:
         while not stop.is_set():

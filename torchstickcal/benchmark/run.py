@@ -257,7 +257,8 @@ def _measured(
             for future in as_completed(futures):
                 yield future.result()
         except BaseException:
-            pool.shutdown(wait=False, cancel_futures=True)  # its processes end because `ours` is closed
+            ours.close()  # its processes end
+            pool.shutdown(cancel_futures=True)
             raise
         pool.shutdown()
 
