@@ -13,6 +13,7 @@ from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
 from typing import ParamSpec, TypeVar
 
+import numpy.ma  # noqa: F401 else numpy imports it at its first median, and a process forked meanwhile waits forever
 import torch
 
 _Arguments = ParamSpec("_Arguments")
