@@ -12,7 +12,9 @@ import torchstickcal
 
 ROOT = Path(__file__).parents[1]
 FLOORS = [
-    ["errors", "files", "workers", "precision", "arrays"],
+    ["errors", "workers", "lazy", "precision"],
+    ["files", "shapes", "arrays"],
+    ["untrusted"],
     ["registry"],
     ["settings"],
     ["geometry"],

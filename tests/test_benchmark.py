@@ -5,6 +5,10 @@ from __future__ import annotations
 import csv
 import dataclasses
 import json
+import signal
+import subprocess
+import sys
+import time
 from html.parser import HTMLParser
 from pathlib import Path
 
@@ -363,6 +367,28 @@ def test_the_command_writes_everything_and_can_be_repeated(folder: Path, tmp_pat
 def test_another_process_measures_the_same(folder: Path, tmp_path: Path):
     one, two = (run_benchmark("x", sources(str(folder)), ["default"], tmp_path / str(jobs), jobs) for jobs in (1, 2))
     assert [row.rotation_deg for row in one] == pytest.approx([row.rotation_deg for row in two], rel=1e-9)
+
+
+START = """
+import sys
+from pathlib import Path
+from torchstickcal.benchmark import run_benchmark, sources
+if __name__ == "__main__":
+    run_benchmark("x", sources("sports-stick-syn"), ["paper"], Path(sys.argv[1]), 2)
+"""
+
+
+@pytest.mark.skipif(not hasattr(signal, "SIGKILL"), reason="the system cannot kill")
+def test_processes_end_with_the_one_that_started_them(tmp_path: Path):
+    (tmp_path / "start.py").write_text(START)
+    command = [sys.executable, tmp_path / "start.py", tmp_path / "out"]
+    parent = subprocess.Popen(command, start_new_session=True, stderr=subprocess.PIPE)
+    rows = tmp_path / "out" / ROWS_FILE
+    while not (rows.exists() and rows.read_bytes()):
+        assert parent.poll() is None
+        time.sleep(0.1)
+    parent.kill()
+    parent.communicate(timeout=20)  # ends when every process that can write to the pipe has ended
 
 
 def test_a_preset_is_scored(capsys: pytest.CaptureFixture[str]):

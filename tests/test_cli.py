@@ -4,9 +4,12 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import os
+import signal
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
@@ -134,6 +137,16 @@ def test_the_same_command_writes_the_same_cameras(session: Path, tmp_path: Path)
     assert (tmp_path / "a" / "calibration.toml").read_bytes() == (tmp_path / "b" / "calibration.toml").read_bytes()
 
 
+BROKEN_WRITER = """
+from torchstickcal.io import calibration_writer
+
+@calibration_writer("broken", "fails", file_name="broken.txt")
+def write(path, calibration):
+    path.write_text("half")
+    raise ZeroDivisionError("by zero")
+"""
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
@@ -155,15 +168,33 @@ def test_the_same_command_writes_the_same_cameras(session: Path, tmp_path: Path)
         (["list", "--plugin", "script.py"], "got SystemExit: 3; expected"),
         (["evaluate", "SESSION", "FOUR"], "number of cameras differs"),
         (["benchmark", "EMPTY"], "no sessions"),
+        (["calibrate", "SESSION", "--out", "broken.py"], "results cannot be written (--out broken.py): got FileExistsError"),
+        (["calibrate", "SESSION", "--out", "broken.py/x"], "results cannot be written"),
+        (["evaluate", "SESSION", "SESSION", "--json", "absent/e.json"], "a file cannot be written (--json)"),
+        (["evaluate", "SESSION", "SESSION", "--json", "empty"], "which is not a file"),
+        (["demo", "--out", "out", "--seed", "-1"], "negative seed"),
+        (["simulate", "golf", "--out", "out", "--seed", "-1"], "negative seed"),
+        (["simulate", "golf", "--out", "out", "--count", "1000000000000"], "too many sessions to simulate (count)"),
+        (["simulate", "golf", "--out", "broken.py"], "results cannot be written"),
+        (["benchmark", "EMPTY", "--count", "0"], "no sessions to measure"),
+        (["benchmark", "hard", "--out", "out", "--jobs", "1000000"], "more processes than this machine can run (--jobs)"),
+        (["calibrate", "SESSION", "--out", "out", "--export", "broken", "--plugin", "writer.py"], "ZeroDivisionError: by zero"),
     ],
 )
 def test_errors_are_one_line_and_leave_nothing(
-    arguments: list[str], message: str, session: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch
+    arguments: list[str],
+    message: str,
+    session: Path,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+    own_parts: object,
 ):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "empty").mkdir()
     (tmp_path / "broken.py").write_text("1 / 0")
     (tmp_path / "script.py").write_text("import sys; sys.exit(3)")
+    (tmp_path / "writer.py").write_text(BROKEN_WRITER)
     observations, truth = golf_session(cameras=3, frames=5)
     sticks = [*observations.sticks, Stick("right_knee", "right_ankle", 0.42)]
     write_npz(tmp_path / "two.npz", dataclasses.replace(observations, sticks=sticks), truth)
@@ -194,3 +225,84 @@ def test_calibrating_imports_neither_kornia_nor_tensorboard():
         "assert not {'kornia', 'tensorboard', 'matplotlib'} & set(sys.modules)"
     )
     subprocess.run([sys.executable, "-c", code], check=True, capture_output=True)
+
+
+def command(*arguments: object, **more: Any) -> subprocess.Popen[str]:
+    """A command in a process of its own."""
+    line = [sys.executable, "-m", "torchstickcal", *map(str, arguments)]
+    return subprocess.Popen(line, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, encoding="latin-1", **more)
+
+
+def test_a_usage_error_is_one_line(capsys: pytest.CaptureFixture[str]):
+    for arguments in ([], ["nonsense"], ["calibrate"], ["demo", "--seed", "x\ny"], ["list", "--out"], ["demo", "--out", ""]):
+        with pytest.raises(SystemExit, match="2"):
+            main(arguments)
+        error = capsys.readouterr().err
+        assert error.startswith("error: ")
+        assert error.count("\n") == 1
+
+
+def test_an_unexpected_error_is_one_line_and_its_traceback_on_request(
+    session: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+):
+    def broken(*_: object) -> None:
+        raise RuntimeError("two\nlines")
+
+    monkeypatch.setattr("torchstickcal.metrics.pose_errors", broken)
+    assert main(["evaluate", str(session), str(session)]) == 2
+    assert capsys.readouterr().err.startswith("error: unexpected RuntimeError: two lines (TORCHSTICKCAL_TRACEBACK=1")
+    monkeypatch.setenv("TORCHSTICKCAL_TRACEBACK", "1")
+    assert main(["evaluate", str(session), str(session)]) == 2
+    assert "in broken" in capsys.readouterr().err
+
+
+def test_a_console_shows_what_it_can(tmp_path: Path):
+    observations, truth = golf_session(cameras=3, frames=8)
+    write_npz(tmp_path / "a.npz", dataclasses.replace(observations, camera_names=("カメラ", "a\nb", "\x1b[31m")), truth)
+    running = [
+        command("evaluate", tmp_path / "a.npz", tmp_path / "a.npz", env=os.environ | {"PYTHONIOENCODING": encoding})
+        for encoding in ("ascii", "cp1252")
+    ]
+    for process in running:
+        out, error = process.communicate()
+        assert (process.returncode, error) == (0, "")
+        for name in ("\\u30ab\\u30e1\\u30e9", "a\\nb", "\\x1b[31m"):
+            assert f"\n{name} " in out
+
+
+@pytest.mark.skipif(os.name == "nt", reason="needs a POSIX shell")
+@pytest.mark.parametrize(("redirection", "status"), [("| true", 0), (">&-", 0), (">&- 2>&-", 0), ("> /dev/full", 2)])
+def test_a_console_that_is_gone_changes_nothing(redirection: str, status: int):
+    line = f"set -o pipefail; '{sys.executable}' -m torchstickcal list configs {redirection}"
+    done = subprocess.run(["bash", "-c", line], capture_output=True, text=True, check=False)
+    assert done.returncode == status
+    assert done.stderr.count("\n") == (1 if status else 0)
+
+
+@pytest.mark.skipif(os.name == "nt", reason="needs POSIX signals")
+def test_an_interrupted_command_ends_at_once_with_one_line(tmp_path: Path):
+    (tmp_path / "plugin.py").write_text("import time; print('started', flush=True); time.sleep(60)")
+    process = command("list", "--plugin", tmp_path / "plugin.py")
+    assert process.stdout is not None
+    assert process.stdout.readline() == "started\n"
+    process.send_signal(signal.SIGINT)
+    _, error = process.communicate(timeout=20)
+    assert (process.returncode, error) == (130, "interrupted\n")
+
+
+@pytest.mark.skipif(os.name == "nt", reason="needs POSIX limits")
+@pytest.mark.parametrize("limit_bytes", [0, 2500, 6000])
+def test_a_full_disk_leaves_the_old_results(session: Path, tmp_path: Path, limit_bytes: int):
+    import resource
+
+    out = tmp_path / "out"
+    assert main(["calibrate", str(session), "--out", str(out), "--refine", "none"]) == 0
+    before = {path.name: path.read_bytes() for path in out.iterdir()}
+    hard = resource.getrlimit(resource.RLIMIT_FSIZE)[1]
+    resource.setrlimit(resource.RLIMIT_FSIZE, (limit_bytes, hard))
+    try:
+        status = main(["calibrate", str(session), "--out", str(out), "--refine", "none", "--stick-length", "2"])
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (hard, hard))
+    assert status == 2
+    assert {path.name: path.read_bytes() for path in out.iterdir()} == before

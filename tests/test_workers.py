@@ -2,12 +2,19 @@
 
 from __future__ import annotations
 
+import faulthandler
 import multiprocessing
+import os
+import subprocess
+import sys
 import threading
 
 import pytest
 import torch
 
+from torchstickcal import calibrate
+from torchstickcal.lazy import cached_property
+from torchstickcal.simulate import golf_session
 from torchstickcal.workers import map_on_workers, on_worker
 
 CPU = torch.device("cpu")
@@ -51,3 +58,70 @@ def test_a_forked_process_has_its_own_workers():
     child.join(20)
     assert child.exitcode == 0
     assert queue.get() == 1
+
+
+def _calibrate_in_child(seconds: float) -> None:
+    faulthandler.dump_traceback_later(seconds, exit=True)
+    os._exit(0 if calibrate(golf_session(cameras=3, frames=10)[0]).converged else 2)
+
+
+@pytest.mark.skipif("fork" not in multiprocessing.get_all_start_methods(), reason="the system cannot fork")
+@pytest.mark.filterwarnings("ignore::DeprecationWarning")
+def test_processes_forked_during_calibrations_can_calibrate():
+    """Whatever lock another thread holds at that moment."""
+    observations, stop = golf_session(cameras=3, frames=10)[0], threading.Event()
+
+    def calibrate_again_and_again() -> None:
+        while not stop.is_set():
+            calibrate(observations, refine="auto")
+
+    calibrate(observations)
+    thread = threading.Thread(target=calibrate_again_and_again)
+    thread.start()
+    try:
+        context = multiprocessing.get_context("fork")
+        children = []
+        for moment in range(8):
+            stop.wait(0.02 * moment)
+            children.append(context.Process(target=_calibrate_in_child, args=(30.0,)))
+            children[-1].start()
+        for child in children:
+            child.join(40)
+        assert [child.exitcode for child in children] == [0] * 8
+    finally:
+        stop.set()
+        thread.join()
+
+
+def test_no_value_is_computed_under_a_lock():
+    """A process that is forked while a value is computed computes it itself; another thread does not wait either."""
+    begun, go_on = threading.Event(), threading.Event()
+
+    class Slow:
+        calls = 0
+
+        @cached_property
+        def value(self) -> int:
+            self.calls += 1
+            if self.calls == 1:
+                begun.set()
+                assert go_on.wait(20)
+            return 3
+
+    slow = Slow()
+    thread = threading.Thread(target=lambda: slow.value)
+    thread.start()
+    assert begun.wait(20)
+    assert slow.value == 3
+    go_on.set()
+    thread.join()
+    assert (slow.value, slow.calls) == (3, 2)
+
+
+def test_no_more_workers_than_processors():
+    code = (
+        "import os, threading, torch\ntorch.set_num_threads(500)\n"
+        "from torchstickcal.workers import on_worker\non_worker(torch.device('cpu'), torch.get_num_threads)\n"
+        "assert torch.get_num_threads() == 500 and threading.active_count() <= 1 + os.cpu_count()"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True)

@@ -1,7 +1,11 @@
 """``python -m torchstickcal``"""
 
+import signal
 import sys
 
-from torchstickcal.cli import main
+if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
+    signal.signal(signal.SIGINT, signal.SIG_DFL)  # until `program` hears Ctrl-C, it ends this process without a traceback
 
-sys.exit(main())
+from torchstickcal.cli import program
+
+sys.exit(program())

@@ -20,6 +20,7 @@ from torchstickcal.losses import LOSSES, CameraPointLoss, LossSettings, Reprojec
 from torchstickcal.model.unknowns import REFINEMENTS
 from torchstickcal.registry import suggestion
 from torchstickcal.settings import Positive, PositiveInt, build, build_dataclass, check_key
+from torchstickcal.untrusted import read_bytes
 
 _EXTENDS = "extends"
 
@@ -229,9 +230,10 @@ def _content(config: str | Path, folder: Path) -> tuple[str, Path, bytes]:
     path = folder / config
     try:
         if path.is_file():
-            return str(path), path.parent, path.read_bytes()
+            return str(path), path.parent, read_bytes(path)
     except (OSError, ValueError) as error:
-        raise ConfigError("a file cannot be read", where="config", got=str(error), expected="a TOML file") from error
+        got = f"{type(error).__name__}: {error}"
+        raise ConfigError("a file cannot be read", where="config", got=got, expected="a TOML file") from error
     raise ConfigError(
         "unknown configuration",
         where="config",

@@ -1,29 +1,125 @@
-"""Files: written completely or not at all, and TOML as any editor saves it."""
+"""Files: written completely or not at all, alone or as a set; TOML as any editor saves it; JSON that every reader accepts."""
 
 from __future__ import annotations
 
+import errno
+import json
+import math
 import os
+import shutil
 import tempfile
 import tomllib
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
+
+from torchstickcal.errors import CalibrationError
+
+try:
+    import fcntl
+except ImportError:  # Windows
+    fcntl = None
+
+_TEMPORARY = ".torchstickcal-"
+_CANNOT_SYNC = {errno.EINVAL, errno.ENOTSUP, errno.ENOSYS, errno.EBADF}
+"""What file systems without fsync, or without fsync of folders, answer."""
 
 
 @contextmanager
 def atomic_path(path: str | Path) -> Iterator[Path]:
     """A temporary path in the folder of ``path``. It replaces ``path`` if the block succeeds, and is deleted otherwise."""
     path = Path(path)
-    descriptor, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
-    os.close(descriptor)
-    temporary = Path(name)
+    with _temporary_folder(path.parent) as folder:
+        yield folder / path.name
+        _to_disk(folder / path.name)
+        (folder / path.name).replace(path)
+
+
+@contextmanager
+def atomic_set(folder: str | Path) -> Iterator[Path]:
+    """A temporary folder for files that belong together. They take their places in ``folder`` if the block succeeds.
+
+    Files of the same names are replaced; others in ``folder`` stay as they are. ``folder`` is created if it does not exist.
+
+    If the block fails or is interrupted, the disk is full, or a file cannot be replaced, ``folder`` is as before. No operating
+    system exchanges several files at once: where the process is killed or the machine stops during the exchange, which takes a
+    few milliseconds, ``folder`` may lack files of the set. It never holds some old and some new ones, because all old ones are
+    moved away before the first new one is put in their place. All files are then still in a hidden folder beside them, whose
+    name begins with ``.torchstickcal-``: new ones in ``new``, old ones in ``old``.
+
+    Raises:
+        OSError: if a file cannot be written.
+
+    Example:
+        >>> import pathlib, tempfile
+        >>> with tempfile.TemporaryDirectory() as parent:
+        ...     with atomic_set(f"{parent}/results") as folder:
+        ...         _ = (folder / "cameras.txt").write_text("left, right")
+        ...         _ = (folder / "points.txt").write_text("1, 2, 3")
+        ...     sorted(path.name for path in pathlib.Path(parent, "results").iterdir())
+        ['cameras.txt', 'points.txt']
+    """
+    folder = Path(folder)
+    with _created(folder), _temporary_folder(folder) as temporary:
+        new, old = temporary / "new", temporary / "old"
+        new.mkdir()
+        old.mkdir()
+        yield new
+        names = sorted(path.name for path in new.iterdir())
+        for name in names:
+            _to_disk(new / name)
+        with _alone(folder):
+            _exchange(folder, names, new, old)
+        shutil.rmtree(old)
+
+
+def try_writing(folder: str | Path, names: Iterable[str] = (), where: str = "--out") -> None:
+    """Try whether files can be written to a folder, and leave no trace of it.
+
+    Args:
+        folder: which; it need not exist.
+        names: of the files.
+        where: what gave the folder, for the message.
+
+    Raises:
+        CalibrationError: if they cannot.
+    """
+    folder = Path(folder)
     try:
-        yield temporary
-        temporary.chmod(0o666 & ~_umask())
-        temporary.replace(path)
-    finally:
-        temporary.unlink(missing_ok=True)
+        with _created(folder, keep=False), _temporary_folder(folder) as temporary:
+            for name in names:
+                (temporary / name).write_bytes(b"?")
+        taken = [name for name in names if (folder / name).is_dir()]
+    except (OSError, ValueError) as error:
+        got = f"{type(error).__name__}: {error}"
+        expected = "a folder that exists or can be created, in which files can be written"
+        raise CalibrationError("results cannot be written", where=f"{where} {folder}", got=got, expected=expected) from error
+    if taken:
+        raise CalibrationError(
+            "results cannot be written", where=f"{where} {folder}", got=f"a folder {taken[0]}", expected="none of that name"
+        )
+
+
+def check_text(text: str, where: str) -> None:
+    """Raise a CalibrationError for a text that no file can hold: one with half of a surrogate pair."""
+    try:
+        text.encode()
+    except UnicodeEncodeError as error:
+        expected = "characters of Unicode, without halves of surrogate pairs"
+        raise CalibrationError("a text that cannot be written", where=where, got=ascii(text), expected=expected) from error
+
+
+def json_text(content: Any, indent: int | None = 2) -> str:
+    """JSON that every reader accepts: null in the place of NaN and infinities. On one line without an ``indent``.
+
+    Example:
+        >>> print(json_text({"mean_m": float("nan")}))
+        {
+          "mean_m": null
+        }
+    """
+    return json.dumps(_with_null(content), indent=indent, allow_nan=False)
 
 
 def parse_toml(content: bytes) -> dict[str, Any]:
@@ -44,8 +140,90 @@ def parse_toml(content: bytes) -> dict[str, Any]:
         raise ValueError("brackets within brackets, too many to be read") from error
 
 
-def _umask() -> int:
-    """The umask of this process, which can only be read by setting it."""
-    mask = os.umask(0)
-    os.umask(mask)
-    return mask
+def _with_null(content: Any) -> Any:
+    if isinstance(content, dict):
+        return {key: _with_null(value) for key, value in content.items()}
+    if isinstance(content, list | tuple):
+        return [_with_null(value) for value in content]
+    return None if isinstance(content, float) and not math.isfinite(content) else content
+
+
+@contextmanager
+def _temporary_folder(folder: Path) -> Iterator[Path]:
+    """A folder in another one, deleted at the end unless it still holds old files of a set in ``old``."""
+    temporary = Path(tempfile.mkdtemp(dir=folder, prefix=_TEMPORARY))
+    try:
+        yield temporary
+    except OSError as error:
+        if error.errno is not None and error.filename is None:  # as of a full disk
+            raise OSError(error.errno, error.strerror, str(folder)) from error
+        raise
+    finally:
+        old = temporary / "old"
+        if not old.is_dir() or not any(old.iterdir()):
+            shutil.rmtree(temporary, ignore_errors=True)
+
+
+@contextmanager
+def _created(folder: Path, keep: bool = True) -> Iterator[None]:
+    """A folder that is created, with those above it, if it does not exist; removed if the block fails or it is not kept."""
+    missing = [path for path in (folder, *folder.parents) if not os.path.lexists(path)]
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        yield
+    except BaseException:
+        keep = False
+        raise
+    finally:
+        for path in () if keep else missing:
+            if path.is_dir() and not any(path.iterdir()):
+                path.rmdir()
+
+
+def _exchange(folder: Path, names: list[str], new: Path, old: Path) -> None:
+    """Move files from ``folder`` to ``old``, then those of the same names from ``new`` to ``folder``; undo it on an error."""
+    for name in names:
+        if (folder / name).is_dir() and not (new / name).is_dir():
+            raise IsADirectoryError(f"a folder has the name of a file to be written: {folder / name}")
+    moves: list[tuple[Path, Path]] = []
+    try:
+        for source, target in ((folder, old), (new, folder)):
+            for name in names:
+                if os.path.lexists(source / name):
+                    moves.append((source / name, target / name))
+                    (source / name).rename(target / name)
+            _to_disk(folder)
+    except BaseException:
+        for source, target in reversed(moves):
+            if os.path.lexists(target) and not os.path.lexists(source):
+                target.rename(source)
+        raise
+
+
+@contextmanager
+def _alone(folder: Path) -> Iterator[None]:
+    """A block that no two processes run at once for the same folder, where the system can lock folders."""
+    if fcntl is None:
+        yield
+        return
+    descriptor = os.open(folder, os.O_RDONLY)
+    try:
+        with suppress(OSError):
+            fcntl.flock(descriptor, fcntl.LOCK_EX)
+        yield
+    finally:
+        os.close(descriptor)
+
+
+def _to_disk(path: Path) -> None:
+    """Have the operating system put a file, or the entries of a folder, on the disk, where it can."""
+    if os.name == "nt" and path.is_dir():
+        return
+    descriptor = os.open(path, os.O_RDONLY | getattr(os, "O_BINARY", 0))
+    try:
+        os.fsync(descriptor)
+    except OSError as error:
+        if error.errno not in _CANNOT_SYNC:
+            raise
+    finally:
+        os.close(descriptor)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import json
-import zipfile
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,28 +14,31 @@ import torch
 from torch import Tensor
 
 from torchstickcal.arrays import FARTHEST_PX, number_of, tensor_of
-from torchstickcal.errors import FileFormatError, ObservationError
+from torchstickcal.errors import ObservationError
 from torchstickcal.files import atomic_path
 from torchstickcal.geometry import se3
 from torchstickcal.geometry.cameras import Intrinsics
+from torchstickcal.shapes import check_shapes
 from torchstickcal.solvers import IterationRecord, StageRecord, Stop
 from torchstickcal.solvers.uncertainty import centre_covariances, point_covariances, relative_scale_std
 from torchstickcal.stick import Stick
+from torchstickcal.untrusted import open_arrays, reading
 
 _FORMAT = "torchstickcal calibration 5"
-_TENSORS = (
-    "rotations",
-    "translations",
-    "points",
-    "covariance",
-    "residuals_px",
-    "inliers",
-    "stick_lengths_m",
-    "sigma_px",
-    "intrinsics",
-    "frame_index",
-)
-_OPTIONAL_TENSORS = ("distortion", "image_size", "times")
+_TENSORS = {
+    "rotations": "C 3 3",
+    "translations": "C 3",
+    "points": "G P 3",
+    "covariance": "K K",
+    "residuals_px": "C F P 2",
+    "inliers": "C F P",
+    "stick_lengths_m": "G S",
+    "sigma_px": "P",
+    "intrinsics": "C 3 3",
+    "frame_index": "C F",
+}
+_OPTIONAL_TENSORS = {"distortion": "C D", "image_size": "C 2", "times": "G"}
+"""The axes of the tensors of a calibration, as of :func:`torchstickcal.shapes.check_shapes`."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -286,42 +288,96 @@ class Calibration:
 
         Raises:
             FileFormatError: if the file is not such a file, or damaged.
+            FileNotFoundError: if there is no such file.
         """
-        try:
-            with np.load(path, allow_pickle=False) as file:
-                arrays = {name: torch.from_numpy(file[name]) for name in file.files if name != "meta"}
-                meta: dict[str, Any] = json.loads(str(file["meta"]))
+        with reading(path, "a file written by Calibration.save", "not a saved calibration"), open_arrays(path) as arrays:
+            meta: dict[str, Any] = json.loads(str(arrays["meta"]))
             if meta.pop("format") != _FORMAT:
-                raise KeyError("format")
-            return Calibration(
-                **{name: arrays[name] for name in _TENSORS},
-                distortion=arrays.get("distortion"),
-                image_size=arrays.get("image_size"),
-                times=arrays.get("times"),
-                fisheye=meta["fisheye"],
-                refined=tuple(meta["refined"]),
-                unknowns={name: _parameter(about, arrays[f"{_UNKNOWN}{name}"]) for name, about in meta["unknowns"].items()},
+                raise KeyError("format of this version")
+            tensors = {name: _tensor(arrays, name) for name in _TENSORS}
+            optional: dict[str, Any] = {name: _tensor(arrays, name) if name in arrays else None for name in _OPTIONAL_TENSORS}
+            sizes = check_shapes("calibration", tensors | optional, _TENSORS | _OPTIONAL_TENSORS)
+            unknowns = {name: _parameter(arrays, name, about, sizes["C"]) for name, about in meta["unknowns"].items()}
+            calibration = Calibration(
+                **tensors,
+                **optional,
+                fisheye=_checked(meta["fisheye"], bool),
+                refined=_texts(meta["refined"]),
+                unknowns=unknowns,
                 sticks=tuple(Stick(*stick) for stick in meta["sticks"]),
-                fps=meta["fps"],
-                point_names=None if meta["point_names"] is None else tuple(meta["point_names"]),
-                camera_names=tuple(meta["camera_names"]),
-                stages=tuple(_stage_record(stage) for stage in meta["stages"]),
-                seconds=meta["seconds"],
-                warnings=tuple(meta["warnings"]),
+                fps=None if meta["fps"] is None else _number(meta["fps"]),
+                point_names=None if meta["point_names"] is None else _texts(meta["point_names"]),
+                camera_names=_texts(meta["camera_names"]),
+                stages=tuple(_stage_record(stage) for stage in _checked(meta["stages"], list)),
+                seconds=_numbers(meta["seconds"]),
+                warnings=_texts(meta["warnings"]),
             )
-        except (KeyError, TypeError, ValueError, EOFError, zipfile.BadZipFile) as error:
-            raise FileFormatError(
-                "not a saved calibration", where=str(path), got=repr(error), expected="a file written by Calibration.save"
-            ) from error
+            counts = {"C": calibration.camera_names, "P": calibration.point_names, "S": calibration.sticks}
+            if any(given is not None and len(given) != sizes[axis] for axis, given in counts.items()):
+                raise ValueError("names or sticks of another number of cameras, points or sticks")
+            if not calibration.stages or not all(stage.iterations for stage in calibration.stages):
+                raise ValueError("no stage, or one without iterations")
+            if len(tensors["covariance"]) != 6 * (sizes["C"] - 1):
+                raise ValueError("a covariance of another number of cameras")
+            return calibration
 
 
-def _parameter(about: dict[str, Any], values: Tensor) -> CameraParameter:
+def _tensor(arrays: Mapping[str, Any], name: str) -> Tensor:
+    """An array of a file, of the kind of numbers that it has by its name."""
+    tensor = torch.from_numpy(arrays[name])
+    kinds = "b" if name == "inliers" else "i" if name == "frame_index" else "iuf" if name == "image_size" else "f"
+    if arrays[name].dtype.kind not in kinds:
+        raise TypeError(f"{name} is of the type {tensor.dtype}")
+    return tensor
+
+
+def _parameter(arrays: Mapping[str, Any], name: str, about: dict[str, Any], cameras: int) -> CameraParameter:
+    values = _tensor(arrays, f"{_UNKNOWN}{name}")
+    if values.shape[:2] != (len(_PARAMETER_TENSORS), cameras):
+        raise ValueError(f"{name} has the shape {tuple(values.shape)}")
     tensors = dict(zip(_PARAMETER_TENSORS, values, strict=True))
-    return CameraParameter(**about | {"components": tuple(about["components"])}, **tensors)
+    return CameraParameter(
+        _checked(about["label"], str),
+        _checked(about["unit"], str),
+        _texts(about["components"]),
+        _checked(about["refined"], bool),
+        **tensors,
+    )
 
 
 def _stage_record(stage: dict[str, Any]) -> StageRecord:
-    iterations = tuple(
-        IterationRecord(**record | {"reprojection_px": tuple(record["reprojection_px"])}) for record in stage["iterations"]
+    iterations = tuple(_iteration_record(record) for record in _checked(stage["iterations"], list))
+    return StageRecord(_checked(stage["name"], str), Stop[stage["stop"]], _number(stage["seconds"]), iterations)
+
+
+def _iteration_record(record: dict[str, Any]) -> IterationRecord:
+    return IterationRecord(
+        session=_checked(record["session"], int),
+        stage=_checked(record["stage"], str),
+        iteration=_checked(record["iteration"], int),
+        cost=_number(record["cost"]),
+        terms=_numbers(record["terms"]),
+        damping=_number(record["damping"]),
+        step_m=_number(record["step_m"]),
+        reprojection_px=tuple(map(_number, record["reprojection_px"])),
+        stick_length_m=_number(record["stick_length_m"]),
     )
-    return StageRecord(stage["name"], Stop[stage["stop"]], stage["seconds"], iterations)
+
+
+def _number(value: Any) -> float:
+    return _checked(value, int | float)
+
+
+def _numbers(values: Any) -> dict[str, float]:
+    return {name: _number(value) for name, value in _checked(values, dict).items()}
+
+
+def _texts(values: Any) -> tuple[str, ...]:
+    return tuple(_checked(value, str) for value in _checked(values, list))
+
+
+def _checked(value: Any, kind: Any) -> Any:
+    """A value of a file, which is of some type."""
+    if not isinstance(value, kind):
+        raise TypeError(f"{type(value).__name__} where {kind} is expected")
+    return value

@@ -13,14 +13,16 @@ from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
 from typing import ParamSpec, TypeVar
 
+import numpy.ma  # noqa: F401 else numpy imports it at its first median, and a process forked meanwhile waits forever
 import torch
 
 _Arguments = ParamSpec("_Arguments")
 _Item = TypeVar("_Item")
 _Result = TypeVar("_Result")
 
-_pools: dict[int, ThreadPoolExecutor] = {}
-"""The pool of each process id, since threads do not survive a fork."""
+_pool: ThreadPoolExecutor | None = None
+_starting = threading.Lock()
+"""Held by the thread that starts the workers."""
 _this_thread = threading.local()
 
 
@@ -33,14 +35,14 @@ def on_worker(
     """The result of a function. For a CPU device it runs in a worker thread."""
     if device.type != "cpu" or _is_worker():
         return function(*arguments, **keywords)
-    return _pool().submit(_with_grad_mode(function), *arguments, **keywords).result()
+    return _workers().submit(_with_grad_mode(function), *arguments, **keywords).result()
 
 
 def map_on_workers(device: torch.device, function: Callable[[_Item], _Result], items: Iterable[_Item]) -> list[_Result]:
     """The results of a function for several items. For a CPU device they run in parallel on the worker threads."""
     if device.type != "cpu" or _is_worker():
         return list(map(function, items))
-    return list(_pool().map(_with_grad_mode(function), items))
+    return list(_workers().map(_with_grad_mode(function), items))
 
 
 def _is_worker() -> bool:
@@ -58,19 +60,32 @@ def _with_grad_mode(function: Callable[_Arguments, _Result]) -> Callable[_Argume
     return run
 
 
-def _pool() -> ThreadPoolExecutor:
-    """The workers of this process, as many as torch has threads when they are first used."""
-    if os.getpid() not in _pools:
-        threads = torch.get_num_threads()
-        pool = ThreadPoolExecutor(threads, "torchstickcal", initializer=_initialise_worker)
-        all_started = threading.Barrier(threads)
-        list(pool.map(lambda _: all_started.wait(), range(threads)))
-        torch.set_num_threads(threads)  # restore the default for threads that are started later
-        _pools[os.getpid()] = pool
-    return _pools[os.getpid()]
+def _workers() -> ThreadPoolExecutor:
+    """The workers of this process, as many as torch has threads when they are first used, at most one per processor."""
+    global _pool
+    with _starting:
+        if _pool is None:
+            torch_threads = torch.get_num_threads()
+            threads = min(torch_threads, os.cpu_count() or 1)
+            pool = ThreadPoolExecutor(threads, "torchstickcal", initializer=_initialise_worker)
+            all_started = threading.Barrier(threads)
+            list(pool.map(lambda _: all_started.wait(), range(threads)))
+            torch.set_num_threads(torch_threads)  # restore the default for threads that are started later
+            _pool = pool
+        return _pool
 
 
 def _initialise_worker() -> None:
     _this_thread.is_worker = True
     torch.get_num_threads()  # without this call, the first operation of the thread would reset the number to the default
     torch.set_num_threads(1)
+
+
+def _forget_workers() -> None:
+    """Begin anew in a forked process: threads do not survive a fork, and another thread may have held the lock."""
+    global _pool, _starting
+    _pool, _starting = None, threading.Lock()
+
+
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=_forget_workers)

@@ -152,8 +152,8 @@ def _is_session(path: Path) -> bool:
     """Whether a file or a folder is a session of a known format, even if it is damaged."""
     try:
         find_reader(path, SESSION_READERS)
-    except FileFormatError:
-        return False
+    except FileFormatError as error:
+        return isinstance(error.__cause__, OSError)  # it cannot be opened: that is reported later
     return True
 
 

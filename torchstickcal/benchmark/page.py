@@ -6,7 +6,6 @@ import base64
 import csv
 import html
 import io
-import json
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, fields
@@ -17,9 +16,11 @@ from matplotlib.figure import Figure
 from torchstickcal.benchmark.figures import figures
 from torchstickcal.benchmark.run import Row
 from torchstickcal.benchmark.tables import Cell, Table, tables
-from torchstickcal.files import atomic_path
+from torchstickcal.files import atomic_set, json_text
 
 CSV_FILE, JSON_FILE, MARKDOWN_FILE, HTML_FILE = "results.csv", "results.json", "benchmark.md", "benchmark.html"
+FILES = (CSV_FILE, JSON_FILE, MARKDOWN_FILE, HTML_FILE)
+"""Names of the files beside the figures."""
 
 _FIGURES_AFTER = {"inputs": ("errors_by_cameras", "errors_by_noise"), "run_time": ("run_time",), "frames": ("frames",)}
 _STYLE = """
@@ -34,15 +35,19 @@ figure { margin: 1rem 0; } img { max-width: 100%; } code { background: #f0f2f4; 
 
 
 def write_results(rows: Sequence[Row], out: Path) -> None:
-    """Write ``results.csv``, ``results.json``, the figures, ``benchmark.md`` and ``benchmark.html`` into a folder."""
+    """Write ``results.csv``, ``results.json``, the figures, ``benchmark.md`` and ``benchmark.html``, all or none."""
+    with atomic_set(out) as folder:
+        _write_all(rows, folder)
+
+
+def _write_all(rows: Sequence[Row], out: Path) -> None:
     made = tables(rows)
     pictures = {name: (caption, _png(figure)) for name, (caption, figure) in figures(rows).items()}
     record = {"rows": [asdict(row) for row in rows], "tables": {table.name: asdict(table) for table in made}}
     _write(out / CSV_FILE, as_csv(rows))
-    _write(out / JSON_FILE, json.dumps(record, indent=1) + "\n")
+    _write(out / JSON_FILE, json_text(record) + "\n")
     for name, (_, picture) in pictures.items():
-        with atomic_path(out / f"{name}.png") as temporary:
-            temporary.write_bytes(picture)
+        (out / f"{name}.png").write_bytes(picture)
     _write(out / MARKDOWN_FILE, markdown(rows, made, {name: caption for name, (caption, _) in pictures.items()}))
     _write(out / HTML_FILE, page(rows, made, pictures))
 
@@ -137,5 +142,4 @@ def _png(figure: Figure) -> bytes:
 
 
 def _write(path: Path, text: str) -> None:
-    with atomic_path(path) as temporary:
-        temporary.write_text(text, "utf-8")
+    path.write_text(text, "utf-8", "backslashreplace")

@@ -4,13 +4,19 @@ from __future__ import annotations
 
 import json
 import multiprocessing
+import os
+import signal
+import threading
 import time
+import typing
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
+from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass
 from functools import lru_cache, partial
+from multiprocessing.connection import Connection
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 
@@ -20,9 +26,12 @@ from torchstickcal.benchmark.cases import Case, Source
 from torchstickcal.benchmark.memory import Memory, input_bytes, memory_needed
 from torchstickcal.benchmark.methods import Method, method
 from torchstickcal.errors import CalibrationError, FileFormatError
+from torchstickcal.files import json_text
 from torchstickcal.metrics import PoseErrors, pose_errors
+from torchstickcal.untrusted import read_bytes
 
 ROWS_FILE = "rows.jsonl"
+_JOBS_PER_PROCESSOR = 8
 CONVERGED, NOT_CONVERGED, FAILED, LACKS_INPUT = "converged", "not converged", "failed", "lacks an input"
 
 
@@ -88,7 +97,7 @@ def run_benchmark(
 
     Raises:
         CalibrationError: if ``out`` holds measurements of another set of cases, for an unknown method, or if ``jobs`` is less
-            than 1.
+            than 1 or more than 8 per processor.
 
     Example:
         >>> import pathlib, tempfile
@@ -99,8 +108,10 @@ def run_benchmark(
         >>> [(row.method, row.outcome, row.translation_m < 0.01) for row in rows]
         [('default', 'converged', True), ('ewand', 'converged', True)]
     """
-    if jobs < 1:
-        raise CalibrationError("no process to measure in", where="--jobs", got=jobs, expected="1 or more")
+    most = _JOBS_PER_PROCESSOR * (os.cpu_count() or 1)
+    if not 1 <= jobs <= most:
+        what = "no process to measure in" if jobs < 1 else "more processes than this machine can run"
+        raise CalibrationError(what, where="--jobs", got=jobs, expected=f"1 to {most}")
     for name in methods:
         method(name)
     out.mkdir(parents=True, exist_ok=True)
@@ -117,7 +128,7 @@ def run_benchmark(
         for done, row in enumerate(_measured(place, missing, jobs, prepare), len(wanted) - len(missing) + 1):
             if row is not None:
                 known[row.case, row.method] = row
-                stream.write(json.dumps(asdict(row)) + "\n")
+                stream.write(json_text(asdict(row), indent=None) + "\n")
                 stream.flush()
             if progress:
                 progress(done, len(wanted), f"{row.case} {row.method}" if row else "skipped: no truth")
@@ -132,14 +143,28 @@ def read_rows(file: Path) -> list[Row]:
     """
     if not file.exists():
         return []
-    content = file.read_bytes()
+    content = read_bytes(file)
     whole = content[: content.rfind(b"\n") + 1]
     if len(whole) < len(content):
         file.write_bytes(whole)
     try:
-        return [Row(**json.loads(line)) for line in whole.splitlines()]
-    except (ValueError, TypeError) as error:
+        return [_row(json.loads(line)) for line in whole.splitlines()]
+    except (ValueError, TypeError, RecursionError) as error:
         raise FileFormatError("not a file of measurements", where=str(file), got=str(error), expected="rows") from error
+
+
+def _row(values: dict[str, Any]) -> Row:
+    """A row from its line.
+
+    Raises:
+        TypeError: if a value is missing, unknown, or of another type.
+    """
+    row = Row(**values)
+    for name, kind in typing.get_type_hints(Row).items():
+        value = getattr(row, name)
+        if not isinstance(value, kind) and not (type(value) is int and isinstance(0.0, kind)):
+            raise TypeError(f"{name} is {value!r}")
+    return row
 
 
 def measure(place: str, source: Source, name: str) -> Row | None:
@@ -222,20 +247,53 @@ def _measured(
             torch.set_num_threads(threads)
         return
     context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(min(jobs, len(missing)), context, initializer=_start, initargs=(prepare,)) as pool:
+    parent, ours = context.Pipe(duplex=False)
+    processes = min(jobs, len(missing))
+    pool = ProcessPoolExecutor(processes, context, initializer=_start, initargs=(parent, prepare))
+    with parent, ours:
         try:
-            for future in as_completed([pool.submit(measure, place, source, name) for source, name in missing]):
+            with _without_interrupts():
+                futures = [pool.submit(measure, place, source, name) for source, name in missing]
+            for future in as_completed(futures):
                 yield future.result()
         except BaseException:
+            ours.close()  # its processes end
             pool.shutdown(cancel_futures=True)
             raise
+        pool.shutdown()
 
 
-def _start(prepare: Callable[[], object] | None) -> None:
-    """Make a new process ready to measure."""
+@contextmanager
+def _without_interrupts() -> Iterator[None]:
+    """A block that starts processes which do not hear Ctrl-C: this process hears it and ends them."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    handler = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, handler)
+
+
+def _start(parent: Connection, prepare: Callable[[], object] | None) -> None:
+    """Make a new process ready to measure.
+
+    Args:
+        parent: a pipe that the process which started this one closes, or that the operating system closes when that one ends.
+        prepare: called at the end.
+    """
+    threading.Thread(target=_end_with, args=(parent,), daemon=True).start()
     torch.set_num_threads(1)
     if prepare:
         prepare()
+
+
+def _end_with(parent: Connection) -> None:
+    """End this process as soon as the other end of a pipe is closed, whatever else it is doing."""
+    with suppress(EOFError, OSError):
+        parent.recv_bytes()
+    os._exit(1)
 
 
 @lru_cache(maxsize=4)

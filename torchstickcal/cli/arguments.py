@@ -4,17 +4,31 @@ from __future__ import annotations
 
 import argparse
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
 from torchstickcal.cli.benchmark import benchmark
 from torchstickcal.cli.calibrate import calibrate_session
 from torchstickcal.cli.evaluate import evaluate
 from torchstickcal.cli.listing import LISTS, list_names
+from torchstickcal.cli.outputs import EXIT_UNUSABLE
 from torchstickcal.cli.simulate import demo, simulate
 
 
+class _Parser(argparse.ArgumentParser):
+    """A parser whose errors are one line, as those of the commands."""
+
+    def error(self, message: str) -> NoReturn:
+        self.exit(EXIT_UNUSABLE, f"error: {' '.join(message.split())}; `{self.prog} --help` shows what there is\n")
+
+
+def _path(text: str) -> Path:
+    if not text:
+        raise argparse.ArgumentTypeError("an empty text is no path")
+    return Path(text)
+
+
 def parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
+    parser = _Parser(
         prog="torchstickcal",
         description="Calibrate a camera rig, in metres, from an athlete's keypoints and a stick of known length.",
     )
@@ -26,7 +40,7 @@ def parser() -> argparse.ArgumentParser:
 
 def _add_calibrate(commands: Any) -> None:
     command = commands.add_parser("calibrate", help="calibrate a session", description="Calibrate a session.")
-    command.add_argument("session", metavar="SESSION", type=Path, help="file or folder of a session")
+    command.add_argument("session", metavar="SESSION", type=_path, help="file or folder of a session")
     _add_out(command, "results")
     _add_format(command, "SESSION")
     _add_config(command)
@@ -49,7 +63,7 @@ def _add_calibrate(commands: Any) -> None:
     command.add_argument(
         "--export", metavar="A,B", help="write the calibration also in these formats, from `torchstickcal list formats`"
     )
-    command.add_argument("--tensorboard", metavar="DIR", type=Path, help="write a TensorBoard log of the calibration")
+    command.add_argument("--tensorboard", metavar="DIR", type=_path, help="write a TensorBoard log of the calibration")
     _add_plugin(command)
     command.set_defaults(run=calibrate_session)
 
@@ -58,12 +72,12 @@ def _add_evaluate(commands: Any) -> None:
     command = commands.add_parser(
         "evaluate", help="compare a calibration with the truth", description="Compare a calibration with the truth."
     )
-    command.add_argument("calibration", metavar="DIR", type=Path, help="folder that `calibrate` wrote, or a calibration file")
+    command.add_argument("calibration", metavar="DIR", type=_path, help="folder that `calibrate` wrote, or a calibration file")
     command.add_argument(
-        "truth", metavar="TRUTH", type=Path, help="a session that holds its truth, or a calibration as for DIR"
+        "truth", metavar="TRUTH", type=_path, help="a session that holds its truth, or a calibration as for DIR"
     )
     _add_format(command, "TRUTH, if it is a session")
-    command.add_argument("--json", metavar="FILE", type=Path, help="write the errors as JSON")
+    command.add_argument("--json", metavar="FILE", type=_path, help="write the errors as JSON")
     _add_plugin(command)
     command.set_defaults(run=evaluate)
 
@@ -81,9 +95,9 @@ def _add_benchmark(commands: Any) -> None:
         help="folder of sessions, or name from `torchstickcal list presets` or `list sports`",
     )
     command.add_argument("--count", metavar="N", type=int, help="only the first N sessions")
-    command.add_argument("--json", metavar="FILE", type=Path, help="write the errors as JSON (without --out)")
+    command.add_argument("--json", metavar="FILE", type=_path, help="write the errors as JSON (without --out)")
     _add_config(command)
-    command.add_argument("--out", metavar="DIR", type=Path, help="folder for the results; what it holds is not measured again")
+    command.add_argument("--out", metavar="DIR", type=_path, help="folder for the results; what it holds is not measured again")
     command.add_argument(
         "--methods",
         metavar="A,B",
@@ -117,7 +131,9 @@ def _add_demo(commands: Any) -> None:
         help="calibrate a simulated golf swing",
         description="Simulate a golf swing seen by six cameras, with noise, gaps and outliers; calibrate it; show the result.",
     )
-    command.add_argument("--out", metavar="DIR", type=Path, default=Path("demo"), help="folder for the results (default: demo)")
+    command.add_argument(
+        "--out", metavar="DIR", type=_path, default=Path("demo"), help="folder for the results (default: demo)"
+    )
     command.add_argument("--seed", metavar="N", type=int, default=0, help="seed of all random numbers (default: 0)")
     command.set_defaults(run=demo, plugin=())
 
@@ -135,7 +151,7 @@ def _add_list(commands: Any) -> None:
 
 def _add_out(command: argparse.ArgumentParser, what: str) -> None:
     help = f"folder for the {what}; created if it does not exist"
-    command.add_argument("--out", metavar="DIR", type=Path, required=True, help=help)
+    command.add_argument("--out", metavar="DIR", type=_path, required=True, help=help)
 
 
 def _add_config(command: argparse.ArgumentParser) -> None:

@@ -8,7 +8,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from torchstickcal.cli.outputs import EXIT_DONE, EXIT_NOT_CONVERGED, write_json
+from torchstickcal.cli.outputs import EXIT_DONE, EXIT_NOT_CONVERGED, try_json, write_json
 from torchstickcal.cli.plugins import import_plugins
 from torchstickcal.errors import CalibrationError
 
@@ -26,6 +26,7 @@ def _score(options: argparse.Namespace) -> int:
     from torchstickcal.config import load_config
 
     config = load_config(options.config)
+    try_json(options.json)
     cases = sources(options.place, options.count)
     width = max(len(case.name) for case in cases)
     scores = []
@@ -54,10 +55,13 @@ def _score_line(score: SequenceScore, width: int) -> str:
 def _measure(options: argparse.Namespace) -> int:
     """The errors of all methods: a folder with measurements, tables, figures and pages."""
     from torchstickcal.benchmark import METHODS, run_benchmark, sources, write_results
+    from torchstickcal.benchmark.page import FILES
     from torchstickcal.benchmark.run import FAILED
+    from torchstickcal.files import try_writing
 
     names = options.methods.split(",") if options.methods else list(METHODS)
     cases = sources(options.place, options.count)
+    try_writing(options.out, FILES)
     prepare = partial(import_plugins, options.plugin)
     rows = run_benchmark(Path(options.place).name, cases, names, options.out, options.jobs, _progress_bar, prepare)
     if not rows:

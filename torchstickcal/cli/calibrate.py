@@ -8,7 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from torchstickcal.cli.outputs import chosen_writers, show_results, write_results
+from torchstickcal.cli.outputs import chosen_writers, result_names, show_results, write_results
 from torchstickcal.errors import CalibrationError
 
 if TYPE_CHECKING:
@@ -21,15 +21,20 @@ if TYPE_CHECKING:
 
 def calibrate_session(options: argparse.Namespace) -> int:
     from torchstickcal.config import load_config
+    from torchstickcal.files import atomic_set, try_writing
     from torchstickcal.io import read_session
     from torchstickcal.pipeline.calibrate import calibrate
 
     config, refine = _refining(load_config(options.config), options.refine, options.no_sync)
     writers = chosen_writers(options.export)
+    try_writing(options.out, result_names(writers))
+    if options.tensorboard is not None:
+        try_writing(options.tensorboard, where="--tensorboard")
     observations, _ = read_session(options.session, options.format)
     observations = _with_stick(observations, options.stick_length, options.stick_sigma)
     calibration = calibrate(observations, config, Progress(_monitor(options.tensorboard)), refine)
-    write_results(calibration, options.out, writers, {"session": str(options.session), "config": options.config})
+    with atomic_set(options.out) as folder:
+        write_results(calibration, folder, writers, {"session": str(options.session), "config": options.config})
     return show_results(calibration, options.out, writers)
 
 

@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from torchstickcal.cli.outputs import CAMERAS_FILE, EXIT_DONE, errors_by_camera, print_errors, write_json
+from torchstickcal.cli.outputs import CAMERAS_FILE, EXIT_DONE, errors_by_camera, print_errors, try_json, write_json
 from torchstickcal.errors import CalibrationError
 
 if TYPE_CHECKING:
@@ -14,10 +14,11 @@ if TYPE_CHECKING:
 
 
 def evaluate(options: argparse.Namespace) -> int:
-    """Cameras are matched by name if both sides have the same names, else by their order."""
+    """Cameras are matched by name if both sides have the same names, each once, else by their order."""
     from torchstickcal.io import Truth
     from torchstickcal.metrics import pose_errors
 
+    try_json(options.json)
     names, estimate = _poses(options.calibration, None)
     truth_names, truth = _poses(options.truth, options.format)
     if len(names) != len(truth_names):
@@ -27,7 +28,7 @@ def evaluate(options: argparse.Namespace) -> int:
             got=f"{len(truth_names)} cameras",
             expected=f"{len(names)} as in {options.calibration}",
         )
-    if set(names) == set(truth_names):
+    if set(names) == set(truth_names) and len(set(names)) == len(names):
         order = [truth_names.index(name) for name in names]
         truth = Truth(truth.rotations[order], truth.translations[order])
     errors = pose_errors(estimate.rotations, estimate.translations, truth.rotations, truth.translations)

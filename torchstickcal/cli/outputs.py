@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -15,7 +14,7 @@ if TYPE_CHECKING:
     from torchstickcal.metrics import PoseErrors
     from torchstickcal.result import Calibration
 
-EXIT_DONE, EXIT_NOT_CONVERGED, EXIT_UNUSABLE = 0, 1, 2
+EXIT_DONE, EXIT_NOT_CONVERGED, EXIT_UNUSABLE, EXIT_INTERRUPTED = 0, 1, 2, 130
 CAMERAS_FORMAT = "pose2sim"
 CAMERAS_FILE, POINTS_FILE, REPORT_FILE = "calibration.toml", "points.npz", "report.json"
 
@@ -40,12 +39,17 @@ def chosen_writers(names: str | None) -> dict[str, Writer]:
     return writers
 
 
+def result_names(writers: dict[str, Writer]) -> list[str]:
+    """The names of the files that :func:`write_results` writes."""
+    return [*writers, POINTS_FILE, REPORT_FILE]
+
+
 def write_results(calibration: Calibration, folder: Path, writers: dict[str, Writer], provenance: dict[str, str]) -> None:
+    """Write the results of a calibration into a folder of :func:`torchstickcal.files.atomic_set`."""
     from torchstickcal.show.report import summary
 
-    folder.mkdir(parents=True, exist_ok=True)
     for file_name, writer in writers.items():
-        writer.function(folder / file_name, calibration)
+        writer.write(folder / file_name, calibration)
     calibration.save(folder / POINTS_FILE)
     write_json(folder / REPORT_FILE, provenance | summary(calibration))
 
@@ -54,7 +58,7 @@ def show_results(calibration: Calibration, folder: Path, writers: dict[str, Writ
     from torchstickcal.show.report import table
 
     print(table(calibration))
-    print(f"\n{', '.join([*writers, POINTS_FILE, REPORT_FILE])} in {folder}")
+    print(f"\n{', '.join(result_names(writers))} in {folder}")
     if calibration.converged:
         return EXIT_DONE
     print(f"not converged: {calibration.status}", file=sys.stderr)
@@ -72,16 +76,30 @@ def errors_by_camera(names: Sequence[str], errors: PoseErrors) -> dict[str, Any]
 
 
 def print_errors(errors: dict[str, Any]) -> None:
-    width = max(6, *(len(camera["name"]) for camera in errors["cameras"]))
+    from torchstickcal.show.report import printable
+
+    width = max(6, *(len(printable(camera["name"])) for camera in errors["cameras"]))
     print(f"{'camera':{width}}  rotation (deg)  translation (mm)")
     mean = {"name": "mean", "rotation_deg": errors["mean_rotation_deg"], "translation_m": errors["mean_translation_m"]}
     for camera in [*errors["cameras"], mean]:
-        print(f"{camera['name']:{width}}  {camera['rotation_deg']:14.5f}  {1000 * camera['translation_m']:16.3f}")
+        print(f"{printable(camera['name']):{width}}  {camera['rotation_deg']:14.5f}  {1000 * camera['translation_m']:16.3f}")
 
 
 def write_json(path: Path | None, content: dict[str, Any]) -> None:
-    from torchstickcal.files import atomic_path
+    from torchstickcal.files import atomic_path, json_text
 
     if path is not None:
         with atomic_path(path) as temporary:
-            temporary.write_text(json.dumps(content, indent=2) + "\n", "utf-8")
+            temporary.write_text(json_text(content) + "\n", "utf-8")
+
+
+def try_json(path: Path | None) -> None:
+    """Raise a CalibrationError if :func:`write_json` could not write a file; leave no trace of it."""
+    from torchstickcal.files import try_writing
+
+    if path is None:
+        return
+    if not path.parent.is_dir() or (path.exists() and not path.is_file()):
+        got = f"{path}, in a folder that does not exist" if not path.parent.is_dir() else f"{path}, which is not a file"
+        raise CalibrationError("a file cannot be written", where="--json", got=got, expected="a file in a folder that exists")
+    try_writing(path.parent, [path.name], "--json")

@@ -6,46 +6,56 @@ import argparse
 import sys
 
 from torchstickcal.cli.calibrate import Progress
-from torchstickcal.cli.outputs import EXIT_DONE, chosen_writers, errors_by_camera, print_errors, show_results, write_results
+from torchstickcal.cli.outputs import (
+    EXIT_DONE,
+    chosen_writers,
+    errors_by_camera,
+    print_errors,
+    result_names,
+    show_results,
+    write_results,
+)
 
 
 def simulate(options: argparse.Namespace) -> int:
+    from torchstickcal.files import atomic_set, try_writing
     from torchstickcal.simulate import session_specs, write_simulated
     from torchstickcal.simulate.render import write_film
 
     specs = session_specs(options.name, options.count, options.seed)
-    options.out.mkdir(parents=True, exist_ok=True)
+    try_writing(options.out, [f"{specs[0].name}.npz"])
     width = max(len(spec.name) for spec in specs)
     for number, spec in enumerate(specs, 1):
         end = "\r" if sys.stderr.isatty() and number < len(specs) else "\n"
         print(f"{number}/{len(specs)} {spec.name:{width}}", end=end, file=sys.stderr, flush=True)
         session = spec.generate()
-        write_simulated(options.out / f"{spec.name}.npz", session)
-        if options.gif:
-            write_film(options.out / f"{spec.name}.gif", session)
+        with atomic_set(options.out) as folder:
+            write_simulated(folder / f"{spec.name}.npz", session)
+            if options.gif:
+                write_film(folder / f"{spec.name}.gif", session)
     print(f"{len(specs)} session{'s' if len(specs) > 1 else ''} in {options.out}")
     return EXIT_DONE
 
 
 def demo(options: argparse.Namespace) -> int:
-    from torchstickcal.files import atomic_path
+    from torchstickcal.files import atomic_set, try_writing
     from torchstickcal.io import write_npz
     from torchstickcal.metrics import pose_errors
     from torchstickcal.pipeline.calibrate import calibrate
     from torchstickcal.show.rig import rig_figure
     from torchstickcal.simulate import Noise, golf_session
 
+    writers = chosen_writers(None)
+    try_writing(options.out, ["session.npz", "rig.png", *result_names(writers)])
     print(
         "A golf swing seen by 6 cameras: 240 frames, 1.5 px noise, 15 % of the keypoints missing, 5 % wrong by up to 150 px.\n"
     )
     observations, truth = golf_session(noise=Noise(sigma_px=1.5, missing=0.15, outliers=0.05), seed=options.seed)
     calibration = calibrate(observations, callback=Progress(None))
-    options.out.mkdir(parents=True, exist_ok=True)
-    write_npz(options.out / "session.npz", observations, truth)
-    writers = chosen_writers(None)
-    write_results(calibration, options.out, writers, {"session": str(options.out / "session.npz"), "config": "default"})
-    with atomic_path(options.out / "rig.png") as temporary:
-        rig_figure(calibration).savefig(temporary, format="png", dpi=120)
+    with atomic_set(options.out) as folder:
+        write_npz(folder / "session.npz", observations, truth)
+        write_results(calibration, folder, writers, {"session": str(options.out / "session.npz"), "config": "default"})
+        rig_figure(calibration).savefig(folder / "rig.png", format="png", dpi=120)
     status = show_results(calibration, options.out, writers)
     print(f"picture in {options.out / 'rig.png'}\n\nAgainst the truth:")
     errors = pose_errors(calibration.rotations, calibration.translations, truth.rotations, truth.translations)

@@ -9,7 +9,6 @@ autograd, is :mod:`torchstickcal.geometry.projection`.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import torch
@@ -17,6 +16,7 @@ from torch import Tensor
 
 from torchstickcal.arrays import tensor_of
 from torchstickcal.errors import ObservationError
+from torchstickcal.lazy import cached_property
 from torchstickcal.precision import at_least_float32
 
 if TYPE_CHECKING:

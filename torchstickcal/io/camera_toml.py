@@ -9,23 +9,26 @@ from __future__ import annotations
 import json
 import re
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import cv2
 import numpy as np
 import torch
 from torch import Tensor
 
-from torchstickcal.files import atomic_path, parse_toml
+from torchstickcal.files import atomic_path, check_text
 from torchstickcal.io.formats import calibration_reader, calibration_writer, reading
-from torchstickcal.io.rig import Rig
+from torchstickcal.io.rig import Rig, as_float64, check_finite
 from torchstickcal.result import Calibration
+from torchstickcal.shapes import check_shapes
+from torchstickcal.untrusted import read_toml
 
 _NAME = "pose2sim"
 _DESCRIPTION = "cameras of Pose2Sim or aniposelib, in metres (.toml)"
 _NOT_CAMERAS = {"metadata", "capture_volume", "charuco", "checkerboard"}
 _CAMERA_TABLE = re.compile(rb"^(?:\xef\xbb\xbf)?\[[^\[\].]+\]\s*\n(?:(?!\[).*\n)*?matrix\s*=", re.MULTILINE)
 """A top-level table with a camera matrix."""
+_Value = TypeVar("_Value")
 
 
 @calibration_writer(_NAME, _DESCRIPTION, file_name="calibration.toml")
@@ -40,6 +43,7 @@ def write_camera_toml(path: str | Path, calibration: Calibration) -> None:
         calibration: the calibration.
 
     Raises:
+        CalibrationError: if a camera has a name that no file can hold.
         OSError: if the file cannot be written.
 
     Example:
@@ -54,6 +58,8 @@ def write_camera_toml(path: str | Path, calibration: Calibration) -> None:
         >>> bool((rig.translations == calibration.translations).all())
         True
     """
+    for name in calibration.camera_names:
+        check_text(name, "camera_names")
     count = len(calibration.camera_names)
     names = [f"cam_{number:0{len(str(count - 1))}d}" for number in range(count)]
     tables = [f"[{name}]\n{_camera(calibration, number)}" for number, name in enumerate(names)]
@@ -72,8 +78,8 @@ def read_camera_toml(path: str | Path) -> Rig:
         The cameras, in the order of the file.
 
     Raises:
-        FileFormatError: if the file is not TOML, holds no camera, or one whose values are not complete.
-        OSError: if the file cannot be opened.
+        FileFormatError: if the file is not TOML, holds no camera, or one whose values are not complete or not finite.
+        FileNotFoundError: if there is no such file.
 
     Example:
         >>> import pathlib, tempfile
@@ -95,18 +101,19 @@ def read_camera_toml(path: str | Path) -> Rig:
         (('left',), [[0.0, 0.0, 2.5]])
     """
     with reading(path, _DESCRIPTION):
-        tables: dict[str, Any] = parse_toml(Path(path).read_bytes())
-        cameras = {key: table for key, table in tables.items() if key not in _NOT_CAMERAS}
+        cameras = {key: table for key, table in read_toml(path).items() if key not in _NOT_CAMERAS}
         if not cameras:
             raise KeyError("table of a camera")
-        rotations = [cv2.Rodrigues(np.array(camera["rotation"], dtype=np.float64))[0] for camera in cameras.values()]
+        vectors = _stacked(cameras, "rotation")
+        check_shapes("cameras", {"rotation": vectors}, {"rotation": "C 3"})
+        check_finite("cameras", {"rotation": vectors})
         return Rig(
-            names=tuple(str(camera.get("name", key)) for key, camera in cameras.items()),
+            names=tuple(_given(camera, "name", str, key) for key, camera in cameras.items()),
             intrinsics=_stacked(cameras, "matrix"),
-            distortion=tuple(torch.tensor(camera["distortions"], dtype=torch.float64) for camera in cameras.values()),
-            fisheye=tuple(bool(camera.get("fisheye", False)) for camera in cameras.values()),
+            distortion=tuple(as_float64("distortions", camera["distortions"]) for camera in cameras.values()),
+            fisheye=tuple(_given(camera, "fisheye", bool, False) for camera in cameras.values()),
             image_size=_stacked(cameras, "size"),
-            rotations=torch.from_numpy(np.stack(rotations)),
+            rotations=torch.from_numpy(np.stack([cv2.Rodrigues(vector.numpy())[0] for vector in vectors])),
             translations=_stacked(cameras, "translation"),
         )
 
@@ -117,7 +124,7 @@ def _camera(calibration: Calibration, index: int) -> str:
     size = 2 * matrix[:2, 2] if calibration.image_size is None else calibration.image_size[index].double().cpu()
     rotation, _ = cv2.Rodrigues(calibration.rotations[index].double().cpu().numpy())
     values = {
-        "name": json.dumps(calibration.camera_names[index], ensure_ascii=False),
+        "name": _quoted(calibration.camera_names[index]),
         "size": size.tolist(),
         "matrix": matrix.tolist(),
         "distortions": _distortion(calibration, index).tolist(),
@@ -141,3 +148,16 @@ def _metadata(calibration: Calibration) -> str:
 
 def _stacked(cameras: dict[str, Any], key: str) -> Tensor:
     return torch.tensor([camera[key] for camera in cameras.values()], dtype=torch.float64)
+
+
+def _given(camera: dict[str, Any], key: str, kind: type[_Value], default: _Value) -> _Value:
+    """A value of a camera's table, or a default where it has none."""
+    value = camera.get(key, default)
+    if not isinstance(value, kind):
+        raise TypeError(f"{key} is a {type(value).__name__} where a {kind.__name__} is expected")
+    return value
+
+
+def _quoted(name: str) -> str:
+    """A text as TOML: JSON, with the one character escaped that JSON allows and TOML does not."""
+    return json.dumps(name, ensure_ascii=False).replace("\x7f", "\\u007f")

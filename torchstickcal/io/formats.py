@@ -6,18 +6,20 @@ A new format is one decorated function, in a file of this folder or in a module 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+import os
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Generic, TypeVar
 
 from torchstickcal.errors import CalibrationError, FileFormatError
+from torchstickcal.files import check_text
 from torchstickcal.io.rig import Rig
 from torchstickcal.io.truth import Truth
 from torchstickcal.observations import Observations
 from torchstickcal.registry import Registry
 from torchstickcal.result import Calibration
+from torchstickcal.untrusted import read_head, reading
 
 HEAD_BYTES = 4096
 """Number of bytes from the beginning of a file that a recogniser is given."""
@@ -49,20 +51,20 @@ class Reader(Generic[_Content]):
         """The content of a file or a folder.
 
         Raises:
-            FileFormatError: if it cannot be read.
+            FileFormatError: if it cannot be opened, or is not of the format.
             ObservationError: if the session that it holds cannot be used for a calibration.
-            OSError: if it cannot be opened.
+            FileNotFoundError: if there is no such file.
         """
         with reading(path, self.description):
             content = self.function(Path(path))
-        if not self.is_content(content):
-            raise FileFormatError(
-                "a reader returns something else than it should",
-                where=f"{self.function.__module__}.{self.function.__name__}",
-                got=type(content).__name__,
-                expected="for a session (Observations, Truth or None), for a calibration a Rig",
-            )
-        return content
+            if not self.is_content(content):
+                raise FileFormatError(
+                    "a reader returns something else than it should",
+                    where=f"{self.function.__module__}.{self.function.__name__}",
+                    got=type(content).__name__,
+                    expected="for a session (Observations, Truth or None), for a calibration a Rig",
+                )
+            return content
 
     def takes(self, path: Path, head: bytes) -> bool:
         """Whether it recognises a path; not where it fails to decide."""
@@ -85,6 +87,25 @@ class Writer:
     function: Callable[[Path, Calibration], None]
     file_name: str
     description: str
+
+    def write(self, path: str | Path, calibration: Calibration) -> None:
+        """Write a calibration.
+
+        Raises:
+            CalibrationError: if the function fails.
+            OSError: if the file cannot be written.
+        """
+        try:
+            self.function(Path(path), calibration)
+        except (CalibrationError, OSError):
+            raise
+        except Exception as error:
+            raise CalibrationError(
+                "a calibration cannot be written in this format",
+                where=f"{self.function.__module__}.{self.function.__name__}",
+                got=f"{type(error).__name__}: {error}",
+                expected=self.description,
+            ) from error
 
 
 SESSION_READERS: Registry[Reader[Session]] = Registry("session format", "torchstickcal.io")
@@ -230,10 +251,10 @@ def read_session(path: str | Path, format: str | None = None) -> Session:
         The observations, and the truth or None.
 
     Raises:
-        FileFormatError: if no format is recognised, or if the file is damaged.
+        FileFormatError: if no format is recognised, or if the file is damaged or cannot be opened.
         ConfigError: for an unknown format.
         ObservationError: if the session cannot be used for a calibration.
-        OSError: if the file cannot be opened.
+        FileNotFoundError: if there is no such file.
 
     Example:
         >>> import tempfile
@@ -257,9 +278,9 @@ def read_calibration(path: str | Path, format: str | None = None) -> Rig:
         format: name of its format, a key of :data:`CALIBRATION_READERS`; None to recognise it by its content.
 
     Raises:
-        FileFormatError: if no format is recognised, or if the file is damaged.
+        FileFormatError: if no format is recognised, or if the file is damaged or cannot be opened.
         ConfigError: for an unknown format.
-        OSError: if the file cannot be opened.
+        FileNotFoundError: if there is no such file.
 
     Example: see :func:`write_calibration`.
     """
@@ -294,7 +315,7 @@ def write_calibration(path: str | Path, calibration: Calibration, format: str) -
         >>> rig.names, rig.translations.shape
         (('cam01', 'cam02', 'cam03'), torch.Size([3, 3]))
     """
-    CALIBRATION_WRITERS[format].function(Path(path), calibration)
+    CALIBRATION_WRITERS[format].write(path, calibration)
 
 
 def find_reader(path: str | Path, *registries: Registry[Any]) -> Reader[Any]:
@@ -307,8 +328,8 @@ def find_reader(path: str | Path, *registries: Registry[Any]) -> Reader[Any]:
         registries: the readers that are asked: :data:`SESSION_READERS`, :data:`CALIBRATION_READERS`, or both.
 
     Raises:
-        FileFormatError: if no reader recognises it; the message lists the known formats.
-        OSError: if it cannot be opened.
+        FileFormatError: if no reader recognises it (the message lists the known formats), or if it cannot be opened.
+        FileNotFoundError: if there is no such file.
 
     Example:
         >>> import tempfile
@@ -320,7 +341,8 @@ def find_reader(path: str | Path, *registries: Registry[Any]) -> Reader[Any]:
         'read_npz'
     """
     path = Path(path)
-    head = b"" if path.is_dir() else _head(path)
+    is_folder = os.path.isdir(path)  # noqa: PTH112 Path.is_dir raises for names that are too long
+    head = b"" if is_folder else read_head(path, HEAD_BYTES)
     for registry in registries:
         for reader in reversed(tuple(registry.values())):
             if reader.takes(path, head):
@@ -329,53 +351,35 @@ def find_reader(path: str | Path, *registries: Registry[Any]) -> Reader[Any]:
     raise FileFormatError(
         f"no {' or '.join(registry.kind for registry in registries)} is recognised",
         where=str(path),
-        got="a folder" if path.is_dir() else f"a file that starts with {head[:16]!r}",
+        got="a folder" if is_folder else f"a file that starts with {head[:16]!r}" if head else "an empty file",
         expected=f"one of: {'; '.join(known)}",
         remedy="If it is one of these, give the name of the format.",
     )
 
 
-@contextmanager
-def reading(path: str | Path, expected: str) -> Iterator[None]:
-    """A block in which a file is read: exceptions become FileFormatErrors that name the file.
+def session_of(observations: Observations, truth: Truth | None) -> Session:
+    """A session that was read from a file.
 
-    Errors that are raised on purpose, and those of the operating system, are not changed.
-
-    Args:
-        path: of the file.
-        expected: what the file should hold.
-
-    Example:
-        >>> from torchstickcal import FileFormatError
-        >>> try:
-        ...     with reading("swing.json", "a length"):
-        ...         length_m = {}["length_m"]
-        ... except FileFormatError as error:
-        ...     print(error)
-        a file is damaged or not of the expected format (swing.json): got no 'length_m'; expected a length.
+    Raises:
+        CalibrationError: if the truth is that of another session, or if a name cannot be written to a file.
     """
-    try:
-        yield
-    except (CalibrationError, OSError):
-        raise
-    except Exception as error:
-        got = f"no {error}" if isinstance(error, KeyError) else f"{type(error).__name__}: {error}"
-        raise FileFormatError(
-            "a file is damaged or not of the expected format", where=str(path), got=got, expected=expected
-        ) from error
+    if truth is not None:
+        truth.check_belongs_to(observations)
+    for name in (*observations.camera_labels, *(observations.point_names or ())):
+        check_text(name, "names of cameras and points")
+    return observations, truth
 
 
 def _is_session(content: object) -> bool:
+    """Whether a value is a session; errors as of :func:`session_of` for one whose parts do not belong together."""
     if not isinstance(content, tuple) or len(content) != 2:
         return False
     observations, truth = content
-    return isinstance(observations, Observations) and isinstance(truth, Truth | None)
+    if not isinstance(observations, Observations) or not isinstance(truth, Truth | None):
+        return False
+    session_of(observations, truth)
+    return True
 
 
 def _is_rig(content: object) -> bool:
     return isinstance(content, Rig)
-
-
-def _head(path: Path) -> bytes:
-    with path.open("rb") as file:
-        return file.read(HEAD_BYTES)

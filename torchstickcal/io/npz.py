@@ -7,13 +7,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 
 from torchstickcal.files import atomic_path
-from torchstickcal.io.formats import reading, session_reader
+from torchstickcal.io.formats import reading, session_of, session_reader
 from torchstickcal.io.truth import Truth
 from torchstickcal.observations import Observations
 from torchstickcal.stick import Stick
+from torchstickcal.untrusted import open_arrays
 
 _DESCRIPTION = "NumPy arrays of keypoints, intrinsics and sticks (.npz)"
 
@@ -54,7 +54,7 @@ def read_npz(path: str | Path) -> tuple[Observations, Truth | None]:
       (F, P, 3), metres, ``true_intrinsics`` (C, 3, 3), ``true_distortion`` (C, D), ``time_offsets_s`` (C,), seconds, and
       ``readout_s`` (C,), seconds.
 
-    Other arrays are ignored.
+    Other arrays are ignored and not read.
 
     Args:
         path: of the file.
@@ -65,7 +65,7 @@ def read_npz(path: str | Path) -> tuple[Observations, Truth | None]:
     Raises:
         FileFormatError: if an array is missing or the file is damaged.
         ObservationError: if the session cannot be used for a calibration.
-        OSError: if the file cannot be opened.
+        FileNotFoundError: if there is no such file.
 
     Example:
         >>> import tempfile
@@ -84,10 +84,8 @@ def read_npz(path: str | Path) -> tuple[Observations, Truth | None]:
         >>> observations.sticks, truth
         ((Stick(start=0, end=1, length_m=1.2, sigma_m=0.001),), None)
     """
-    with reading(path, "a session with keypoints, intrinsics and sticks"):
-        with np.load(path, allow_pickle=False) as file:
-            arrays: dict[str, Any] = {name: file[name] for name in file.files}
-        return _observations(arrays), _truth(arrays)
+    with reading(path, "a session with keypoints, intrinsics and sticks"), open_arrays(path) as arrays:
+        return session_of(_observations(arrays), _truth(arrays))
 
 
 def write_npz(
@@ -153,7 +151,7 @@ def _names(arrays: Mapping[str, Any], name: str) -> list[str] | None:
 def _truth(arrays: Mapping[str, Any]) -> Truth | None:
     if "rotation" not in arrays:
         return None
-    return Truth(**{field: torch.from_numpy(arrays[name]) for field, name in _TRUTH_ARRAYS.items() if name in arrays})
+    return Truth(**{field: arrays[name] for field, name in _TRUTH_ARRAYS.items() if name in arrays})
 
 
 def _arrays(observations: Observations) -> dict[str, Any]:

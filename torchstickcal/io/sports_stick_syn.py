@@ -9,7 +9,7 @@ import numpy as np
 import torch
 
 from torchstickcal.io import safe_pickle
-from torchstickcal.io.formats import reading, session_reader
+from torchstickcal.io.formats import reading, session_of, session_reader
 from torchstickcal.io.truth import Truth
 from torchstickcal.observations import Observations
 from torchstickcal.stick import Stick
@@ -38,7 +38,7 @@ def read_sports_stick_syn(path: str | Path) -> tuple[Observations, Truth]:
     Raises:
         FileFormatError: if the file is not such a sequence, is damaged, or holds more than plain data.
         ObservationError: if the session cannot be used for a calibration.
-        OSError: if the file cannot be opened.
+        FileNotFoundError: if there is no such file.
 
     Example:
         >>> import pathlib, pickle, tempfile
@@ -66,7 +66,9 @@ def read_sports_stick_syn(path: str | Path) -> tuple[Observations, Truth]:
     """
     data = safe_pickle.load(path)
     with reading(path, _DESCRIPTION):
-        return _observations(data), _truth(data)
+        observations, truth = _observations(data), _truth(data)
+        session_of(observations, truth)
+        return observations, truth
 
 
 def _observations(data: dict[str, Any]) -> Observations:
@@ -94,7 +96,7 @@ def _joint_names(count: int) -> tuple[str, ...]:
 
 def _truth(data: dict[str, Any]) -> Truth:
     return Truth(
-        torch.tensor(data["Rs_gt"], dtype=torch.float64),
-        torch.tensor(data["ts_gt"], dtype=torch.float64).flatten(1),
-        torch.from_numpy(np.concatenate([np.array(data["pose_3d_gt"]), np.array(data["stick_3d_gt"])], axis=1)),
+        torch.from_numpy(np.array(data["Rs_gt"], float)),
+        torch.from_numpy(np.array(data["ts_gt"], float)).flatten(1),
+        torch.from_numpy(np.concatenate([np.array(data["pose_3d_gt"], float), np.array(data["stick_3d_gt"], float)], axis=1)),
     )

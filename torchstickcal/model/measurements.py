@@ -9,13 +9,13 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
 
 import torch
 from torch import Tensor
 from torch.nn.functional import pad
 
 from torchstickcal.geometry.cameras import Intrinsics
+from torchstickcal.lazy import cached_property
 from torchstickcal.model.state import State
 from torchstickcal.model.unknowns import Columns, ImageMotion, RigUnknowns
 from torchstickcal.observations import Observations

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from functools import cached_property
 from typing import TypeVar
 
 import torch
@@ -16,6 +15,7 @@ from torch import Tensor
 
 from torchstickcal.geometry import se3
 from torchstickcal.geometry.cameras import Intrinsics, PixelMap
+from torchstickcal.lazy import cached_property
 from torchstickcal.losses import CameraPointLoss, FrameLoss, Loss, TrackLoss
 from torchstickcal.losses.camera_point import CameraPointTerms, UnknownTerms
 from torchstickcal.losses.frame import FrameTerms

@@ -8,6 +8,8 @@ from pathlib import Path
 from typing import Any, Literal, Protocol
 
 from torchstickcal.config import Config, Refine, load_config, with_refine
+from torchstickcal.losses import LOSSES
+from torchstickcal.model.unknowns import REFINEMENTS
 from torchstickcal.observations import Observations
 from torchstickcal.pipeline.adjust import adjust_points
 from torchstickcal.pipeline.check import CameraCheck
@@ -17,6 +19,8 @@ from torchstickcal.pipeline.selection import ModelSelection
 from torchstickcal.result import Calibration
 from torchstickcal.solvers import IterationRecord, ignore_record
 from torchstickcal.workers import on_worker
+
+_ = len(LOSSES), len(REFINEMENTS)  # imported now: a process that is forked while another thread imports them lacks some
 
 
 class Callback(Protocol):

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from functools import cached_property
 
 from torch import Tensor
 
 from torchstickcal.errors import ObservationError, RigError
+from torchstickcal.lazy import cached_property
 from torchstickcal.model.measurements import Measurements
 from torchstickcal.model.unknowns import REFINEMENTS, clock_refinements, with_refinements
 from torchstickcal.observations import Observations

@@ -13,7 +13,7 @@ from torchstickcal.result import Calibration, CameraParameter
 def table(calibration: Calibration) -> str:
     """The calibration as a text to print: cameras, sticks, stages."""
     cameras = zip(
-        calibration.camera_names,
+        map(printable, calibration.camera_names),
         calibration.camera_centres.tolist(),
         calibration.camera_std_m.tolist(),
         calibration.camera_std_deg.tolist(),
@@ -23,7 +23,14 @@ def table(calibration: Calibration) -> str:
     )
     rows = [["camera", "centre x, y, z (m)", "+- mm", "+- deg", "reprojection (px)", "keypoints"]]
     rows += [
-        [name, " ".join(f"{v:8.4f}" for v in centre), f"{1000 * std_m:.2f}", f"{std_deg:.4f}", f"{px:.3f}", str(used)]
+        [
+            name,
+            " ".join(f"{v:8.4f}" for v in centre),
+            f"{1000 * std_m:.2f}",
+            f"{std_deg:.4f}",
+            f"{px:.3f}",
+            str(used),
+        ]
         for name, centre, std_m, std_deg, px, used in cameras
     ]
     text = [_aligned(rows), ""]
@@ -36,7 +43,7 @@ def table(calibration: Calibration) -> str:
         for stick, lengths in zip(calibration.sticks, calibration.stick_lengths_m.mT, strict=True):
             known = lengths[lengths.isfinite()]
             spread = f"{1000 * float(known.std()):.2f}" if len(known) > 1 else "-"
-            ends = " - ".join(_point_name(calibration, end) for end in stick.ends)
+            ends = " - ".join(printable(_point_name(calibration, end)) for end in stick.ends)
             mean = f"{float(known.mean()):.5f}" if len(known) else "-"
             rows.append([ends, f"{stick.length_m:.5f}", mean, spread, str(len(known))])
         text += [_aligned(rows), ""]
@@ -113,6 +120,16 @@ def summary(calibration: Calibration) -> dict[str, Any]:
     }
 
 
+def printable(text: str) -> str:
+    r"""A text for one place in a table: line ends and other characters that have no shape of their own are escaped.
+
+    Example:
+        >>> print(printable("left\ncamera"))
+        left\ncamera
+    """
+    return "".join(letter if letter.isprintable() else letter.encode("unicode_escape").decode() for letter in text)
+
+
 def _parameter_rows(calibration: Calibration, parameter: CameraParameter) -> list[list[str]]:
     """A table of one unknown of the cameras: what was given, what was used, and what the keypoints suggest."""
     factor, unit = (1000, "ms") if parameter.unit == "s" else (1, parameter.unit)
@@ -131,7 +148,7 @@ def _parameter_rows(calibration: Calibration, parameter: CameraParameter) -> lis
             for number in range(len(components))
             for value, std in (("value", "std"), ("suggested", "suggested_std"))
         ]
-        rows.append([label, *cells])
+        rows.append([printable(label), *cells])
     return rows
 
 

@@ -31,6 +31,7 @@ _PAPER_FPS = 10.0
 _PAPER_SEEDS = {"hemisphere": 0, "random": 10_000}
 _HARD_SPORTS = ("golf", "baseball", "hockey", "kendo", "wand")
 _HARD_LAYOUTS = ("hemisphere", "random", "ring", "line", "arena")
+_MOST_SESSIONS = 1_000_000
 _VIDEO = Lens(distortion=(-0.1, 0.02, 0.0005, -0.0005, 0.0))
 
 
@@ -64,7 +65,7 @@ def session_specs(name: str, count: int | None = None, seed: int = 0) -> tuple[S
         seed: added to the seed of every session, 0 or more.
 
     Raises:
-        CalibrationError: for an unknown name, a count below 1, or a negative seed.
+        CalibrationError: for an unknown name, a count below 1 or above a million, or a negative seed.
 
     Example:
         >>> from torchstickcal.simulate import session_specs
@@ -75,8 +76,9 @@ def session_specs(name: str, count: int | None = None, seed: int = 0) -> tuple[S
         near = suggestion(name, [*PRESETS, *SPORTS])
         known = f"a preset ({', '.join(PRESETS)}) or a sport ({', '.join(SPORTS)})"
         raise CalibrationError("no preset or sport of that name", where="name", got=repr(name), expected=known, remedy=near)
-    if count is not None and count < 1:
-        raise CalibrationError("no sessions to simulate", where="count", got=count, expected="1 or more")
+    if count is not None and not 1 <= count <= _MOST_SESSIONS:
+        what = "no sessions to simulate" if count < 1 else "too many sessions to simulate"
+        raise CalibrationError(what, where="count", got=count, expected=f"1 to {_MOST_SESSIONS}")
     if seed < 0:
         raise CalibrationError("negative seed", where="seed", got=seed, expected="0 or more")
     if name in PRESETS:

@@ -10,9 +10,10 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from torchstickcal.errors import FileFormatError
+from torchstickcal.errors import CalibrationError, FileFormatError
 from torchstickcal.io import Truth, read_npz, write_npz
 from torchstickcal.observations import Observations
+from torchstickcal.shapes import check_shapes
 from torchstickcal.simulate.athlete import Motion
 from torchstickcal.simulate.clocks import Clocks, exposed_points
 from torchstickcal.simulate.cube import Cube, CubeViews
@@ -22,6 +23,7 @@ from torchstickcal.simulate.regimes import Regime, Views, apply
 from torchstickcal.simulate.rigs import CameraRig, Lens, camera_rig
 from torchstickcal.simulate.skeleton import JOINTS, STANDING_HEIGHT_M, Skeleton
 from torchstickcal.stick import Stick
+from torchstickcal.untrusted import open_arrays, reading
 
 Array = NDArray[np.float64]
 
@@ -144,9 +146,12 @@ class SessionSpec:
         """Generate the session.
 
         Raises:
-            CalibrationError: for an unknown sport, path or layout, or an impossible number of cameras or height.
+            CalibrationError: for an unknown sport, path or layout, a negative seed, or an impossible number of cameras or
+                height.
             ObservationError: if no frame is left in which two cameras see the stick.
         """
+        if self.seed < 0:
+            raise CalibrationError("negative seed", where="seed", got=self.seed, expected="0 or more")
         rng_rig, rng_clocks, rng_assumptions, rng_keypoints, rng_cube = np.random.default_rng(self.seed).spawn(5)
         motion = self.motion
         rig = camera_rig(self.layout, self.cameras, rng_rig, self.lens, self.radius_m)
@@ -224,23 +229,29 @@ def read_simulated(path: str | FilePath) -> SimulatedSession:
         FileFormatError: if the file is damaged or does not hold a simulated session.
     """
     observations, truth = read_npz(path)
-    with np.load(path, allow_pickle=False) as file:
-        data = {name: file[name] for name in ("name", "inliers", "sigma_px", "height_m") if name in file.files}
-        cube = CubeViews(file["cube_corners_m"], file["cube_keypoints"]) if "cube_corners_m" in file.files else None
-    if truth is None or len(data) < 4 or observations.fps is None:
-        raise FileFormatError(
-            "not a simulated session",
-            where=str(path),
-            got=f"arrays {sorted(data)}",
-            expected="truth, inliers, sigma_px, height_m",
+    with reading(path, "a simulated session"), open_arrays(path) as arrays:
+        missing = [name for name in ("name", "inliers", "sigma_px", "height_m") if name not in arrays]
+        if truth is None or missing or observations.fps is None:
+            raise FileFormatError(
+                "not a simulated session",
+                where=str(path),
+                got=f"no {', '.join(missing) or 'truth or frame rate'}",
+                expected="truth, inliers, sigma_px, height_m",
+            )
+        per_keypoint = {"visible": observations.visible, "inliers": arrays["inliers"], "sigma_px": arrays["sigma_px"]}
+        check_shapes("session", per_keypoint, dict.fromkeys(per_keypoint, "C F P"))
+        cube = None
+        if "cube_corners_m" in arrays:
+            cube = CubeViews(arrays["cube_corners_m"], arrays["cube_keypoints"])
+            views = {"cameras": observations.visible, "cube_corners_m": cube.corners_m, "cube_keypoints": cube.keypoints}
+            check_shapes("session", views, {"cameras": "C F P", "cube_corners_m": "K 3", "cube_keypoints": "C K 2"})
+        return SimulatedSession(
+            name=str(arrays["name"]),
+            observations=observations,
+            truth=truth,
+            inliers=arrays["inliers"],
+            sigma_px=arrays["sigma_px"],
+            cube=cube,
+            height_m=float(arrays["height_m"]),
+            fps=observations.fps,
         )
-    return SimulatedSession(
-        name=str(data["name"]),
-        observations=observations,
-        truth=truth,
-        inliers=data["inliers"],
-        sigma_px=data["sigma_px"],
-        cube=cube,
-        height_m=float(data["height_m"]),
-        fps=observations.fps,
-    )

@@ -6,13 +6,13 @@ Body axes: x to the athlete's right, y forward, z up, the soles on z = 0. The re
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
 from torchstickcal.errors import CalibrationError
 from torchstickcal.io import SPORTS_STICK_SYN_JOINTS
+from torchstickcal.lazy import cached_property
 
 Array = NDArray[np.float64]
 

@@ -9,10 +9,11 @@ products of coordinates. These sums are correlations, so the fast Fourier transf
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property
 
 import torch
 from torch import Tensor
+
+from torchstickcal.lazy import cached_property
 
 _PRODUCTS = torch.tensor([[0, 1, 2], [1, 3, 4], [2, 4, 5]])
 """Index of each entry of (x, y, 1) (x, y, 1)' among its six distinct entries xx, xy, x, yy, y, 1."""

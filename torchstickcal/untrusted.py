@@ -1,0 +1,203 @@
+"""Files from anywhere: nothing of them is run, and what they declare is checked before memory is given to it."""
+
+from __future__ import annotations
+
+import math
+import os
+import stat
+import zipfile
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, BinaryIO
+
+import numpy as np
+from numpy.typing import NDArray
+
+from torchstickcal.errors import CalibrationError, FileFormatError
+from torchstickcal.files import parse_toml
+
+GROWTH = 100
+"""How much more memory the content of a file may need than the file is long. Keypoints of which one in a hundred is seen stay
+below."""
+SLACK_BYTES = 16 * 2**20
+"""What a file of any size may need in addition."""
+LONGEST_TOML_BYTES = 16 * 2**20
+_LONGEST_CAUSE = 300
+"""Characters of a foreign message that an error shows."""
+_MOST_EMPTY_ROWS = 10_000
+_COMPRESSIONS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
+"""Those that NumPy writes; others may ask for memory of their own."""
+_HEADERS = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
+_KINDS = "biufcU"
+"""Kinds of arrays that are read: numbers, truth values and texts."""
+
+
+@contextmanager
+def reading(path: str | Path, expected: str, what: str = "a file is damaged or not of the expected format") -> Iterator[None]:
+    """A block in which a file is read: every exception becomes a FileFormatError that names the file.
+
+    The library's more special errors, and FileNotFoundError, are not changed.
+
+    Args:
+        path: of the file.
+        expected: what the file should hold.
+        what: the problem, in one phrase, if it holds something else.
+
+    Example:
+        >>> from torchstickcal import FileFormatError
+        >>> try:
+        ...     with reading("swing.json", "a length"):
+        ...         length_m = {}["length_m"]
+        ... except FileFormatError as error:
+        ...     print(error)
+        a file is damaged or not of the expected format (swing.json): got no 'length_m'; expected a length.
+    """
+    try:
+        yield
+    except FileNotFoundError:
+        raise
+    except CalibrationError as error:
+        if type(error) is not CalibrationError:
+            raise
+        where = f"{path}: {error.where}"
+        raise FileFormatError(error.what, where=where, got=error.got, expected=error.expected, remedy=error.remedy) from error
+    except Exception as error:
+        cause = f"no {error}" if isinstance(error, KeyError) else f"{type(error).__name__}: {error}"
+        raise FileFormatError(what, where=str(path), got=_shortened(cause), expected=expected) from error
+
+
+def open_regular(path: str | Path) -> BinaryIO:
+    """A regular file, open for reading: no folder, no device, and nothing that another program writes while it is read.
+
+    Raises:
+        FileFormatError: if it is something else, or cannot be opened.
+        FileNotFoundError: if there is no such file.
+    """
+    try:
+        descriptor = os.open(path, os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0))
+    except FileNotFoundError:
+        raise
+    except (OSError, ValueError) as error:
+        got = f"{type(error).__name__}: {error}"
+        if os.path.isdir(path):  # noqa: PTH112 Path.is_dir raises for names that are too long
+            raise _not_regular(path, "a folder") from error
+        raise FileFormatError(
+            "a file cannot be opened", where=str(path), got=got, expected="a file that can be read"
+        ) from error
+    mode = os.fstat(descriptor).st_mode
+    if not stat.S_ISREG(mode):
+        os.close(descriptor)
+        raise _not_regular(path, "a folder" if stat.S_ISDIR(mode) else "a device, a pipe or a socket")
+    return os.fdopen(descriptor, "rb")
+
+
+def read_head(path: str | Path, size: int) -> bytes:
+    """The first bytes of a regular file; errors as of :func:`open_regular`."""
+    with reading(path, "a file that can be read"), open_regular(path) as file:
+        return file.read(size)
+
+
+def read_bytes(path: str | Path) -> bytes:
+    """The content of a regular file; errors as of :func:`open_regular`."""
+    with reading(path, "a file that can be read"), open_regular(path) as file:
+        return file.read()
+
+
+def read_toml(path: str | Path) -> dict[str, Any]:
+    """The tables of a TOML file of at most :data:`LONGEST_TOML_BYTES`.
+
+    Raises:
+        FileFormatError: if it is no such file; the message says why.
+        FileNotFoundError: if there is no such file.
+    """
+    with reading(path, "a TOML file in UTF-8"), open_regular(path) as file:
+        content = file.read(LONGEST_TOML_BYTES + 1)
+        if len(content) > LONGEST_TOML_BYTES:
+            raise ValueError(f"more than {LONGEST_TOML_BYTES} bytes")
+        return parse_toml(content)
+
+
+@contextmanager
+def open_arrays(path: str | Path) -> Iterator[Mapping[str, NDArray[Any]]]:
+    """The arrays of an ``.npz`` file by name. An array is read when it is first asked for; others are not looked at.
+
+    All arrays that are read may together have :data:`GROWTH` times the size of the file and :data:`SLACK_BYTES`. They have the
+    byte order of this machine. Use it within :func:`reading`: looking up an array of a damaged file raises anything.
+
+    Example:
+        >>> import tempfile
+        >>> import numpy as np
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     np.savez(f"{folder}/a.npz", lengths_m=[1.0, 2.0])
+        ...     with open_arrays(f"{folder}/a.npz") as arrays:
+        ...         list(arrays), arrays["lengths_m"]
+        (['lengths_m'], array([1., 2.]))
+    """
+    with open_regular(path) as file, zipfile.ZipFile(file) as archive:
+        yield _Arrays(archive, GROWTH * os.fstat(file.fileno()).st_size + SLACK_BYTES)
+
+
+class _Arrays(Mapping[str, NDArray[Any]]):
+    """The arrays of an archive, read when they are asked for."""
+
+    def __init__(self, archive: zipfile.ZipFile, budget_bytes: int) -> None:
+        self._archive = archive
+        self._left_bytes = budget_bytes
+        self._names = [name.removesuffix(".npy") for name in archive.namelist() if name.endswith(".npy")]
+        self._read: dict[str, NDArray[Any]] = {}
+
+    def __getitem__(self, name: str) -> NDArray[Any]:
+        if name not in self._names:
+            raise KeyError(name)
+        if name not in self._read:
+            self._read[name] = self._array(name)
+        return self._read[name]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(dict.fromkeys(self._names))
+
+    def __len__(self) -> int:
+        return len(set(self._names))
+
+    def _array(self, name: str) -> NDArray[Any]:
+        info = self._archive.getinfo(f"{name}.npy")
+        if info.compress_type not in _COMPRESSIONS:
+            raise ValueError(f"array {name!r} is compressed by method {info.compress_type}, which NumPy does not write")
+        self._left_bytes -= info.file_size
+        if self._left_bytes < 0:
+            raise ValueError(f"array {name!r} of {info.file_size} bytes: more than {GROWTH} times the size of the file")
+        with self._archive.open(info) as stream:
+            _check_header(name, stream, info.file_size)
+        with self._archive.open(info) as stream:
+            array = np.lib.format.read_array(stream, allow_pickle=False)
+        return array.astype(array.dtype.newbyteorder("="), copy=False)
+
+
+def check_size(shape: tuple[int, ...], dtype: np.dtype[Any], size: int) -> None:
+    """Raise a ValueError unless an array of a shape and a type has so many bytes.
+
+    An empty array has few rows: as lists, a million rows of nothing would need memory.
+    """
+    rows = math.prod(length for length in shape if length)
+    if min(shape, default=0) < 0 or math.prod(shape) * dtype.itemsize != size or rows > size + _MOST_EMPTY_ROWS:
+        raise ValueError(f"an array declares the shape {shape} but holds {size} bytes")
+
+
+def _check_header(name: str, stream: Any, size: int) -> None:
+    """Refuse an array that is not of numbers or texts, or that declares another size than is there."""
+    version = np.lib.format.read_magic(stream)
+    if version not in _HEADERS:
+        raise ValueError(f"array {name!r} is of version {version} of the format")
+    shape, _, dtype = _HEADERS[version](stream)
+    if dtype.kind not in _KINDS or dtype.hasobject or dtype.names or dtype.subdtype:
+        raise ValueError(f"array {name!r} is of the type {dtype}, not of numbers or texts")
+    check_size(shape, dtype, size - stream.tell())
+
+
+def _not_regular(path: str | Path, got: str) -> FileFormatError:
+    return FileFormatError("not a file", where=str(path), got=got, expected="a regular file")
+
+
+def _shortened(text: str) -> str:
+    return text if len(text) <= _LONGEST_CAUSE else f"{text[:_LONGEST_CAUSE]}..."
