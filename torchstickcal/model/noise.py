@@ -16,8 +16,8 @@ _CUT = 4.0
 """Residual, in standard deviations, beyond which a keypoint counts as an outlier in the estimate of the noise."""
 _ITERATIONS = 5
 _MAX_FRAMES = 2000
-_MEDIAN_CHI2_2 = 2 * math.log(2)
-"""Median of the chi-square distribution with 2 degrees of freedom."""
+_QUARTILE_CHI2_2 = 2 * math.log(4 / 3)
+"""Lower quartile of the chi-square distribution with 2 degrees of freedom."""
 _MIN_SIGMA_PX = 1e-4
 _MIN_ACCELERATION_M = 1e-5
 _MIN_VARIANCE_RATIO = 0.01
@@ -104,11 +104,19 @@ def _initial_variance(squared: Tensor, visible: Tensor) -> Tensor:
     """
     views = visible.sum(1, keepdim=True)
     corrected = (squared * (2 * views / (2 * views - 3).clamp_min(1))).where(visible, torch.nan)
-    median = corrected.flatten(1, 2).nanmedian(1).values
-    if not bool(median.isfinite().all()):
-        overall = corrected.flatten(1).nanmedian(1, keepdim=True).values.nan_to_num(nan=1.0)
-        median = median.where(median.isfinite(), overall)
-    return (median / _MEDIAN_CHI2_2).clamp_min(_MIN_SIGMA_PX**2)
+    quartile = _lower_quartile(corrected.flatten(1, 2))
+    if not bool(quartile.isfinite().all()):
+        overall = _lower_quartile(corrected.flatten(1)[..., None]).nan_to_num(nan=1.0)
+        quartile = quartile.where(quartile.isfinite(), overall)
+    return (quartile / _QUARTILE_CHI2_2).clamp_min(_MIN_SIGMA_PX**2)
+
+
+def _lower_quartile(values: Tensor) -> Tensor:
+    """Lower quartile (B, P) of the values (B, n, P) that are not NaN."""
+    ordered = values.sort(dim=1).values
+    last = ordered.shape[1] - 1
+    at = ((values.isfinite() | values.isinf()).sum(1) // 4).clamp_max(last)
+    return ordered.gather(1, at[:, None])[:, 0]
 
 
 def _truncated_moment(cut: float) -> float:
