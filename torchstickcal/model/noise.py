@@ -12,9 +12,12 @@ from torchstickcal.losses.track import combined, consecutive
 from torchstickcal.model.measurements import Measurements
 from torchstickcal.model.state import State
 
-_CUT = 4.0
-"""Residual, in standard deviations, beyond which a keypoint counts as an outlier in the estimate of the noise."""
-_ITERATIONS = 5
+_CUT = 2.5
+"""Residual, in standard deviations, beyond which a keypoint takes no part in the estimate of the noise. With a wide cut, outliers
+raise the estimate, it lets more of them in, and stays at several times the noise."""
+_ITERATIONS = 3
+_MAX_SORTED = 5000
+"""Residuals of a point, evenly spaced in time, whose quartile is taken."""
 _MAX_FRAMES = 2000
 _QUARTILE_CHI2_2 = 2 * math.log(4 / 3)
 """Lower quartile of the chi-square distribution with 2 degrees of freedom."""
@@ -27,7 +30,7 @@ _MIN_VARIANCE_RATIO = 0.01
 def estimate_sigma_px(measurements: Measurements, squared_residuals: Tensor) -> Tensor:
     """Standard deviation of the keypoints along an image axis, for each point, (B, P), pixels.
 
-    It is the root mean square of the residuals below 4 standard deviations, corrected for this cut and for the three degrees of
+    It is the root mean square of the residuals below 2.5 standard deviations, corrected for this cut and for the three degrees of
     freedom of each 3D point. The estimates of different points are then shrunk towards their common mean (empirical Bayes on
     the log variances). If their differences can be explained by chance, all points get the same value. Of a long session, 2000
     evenly spaced frames are used.
@@ -97,26 +100,18 @@ def estimate_acceleration_m(measurements: Measurements, points: Tensor, point_va
 
 
 def _initial_variance(squared: Tensor, visible: Tensor) -> Tensor:
-    """Variance (B, P) from the median of the squared residuals.
+    """Variance (B, P) from the lower quartile of the squared residuals, which the better keypoints determine.
 
     Each squared residual is first divided by the fraction that remains after its 3D point was fitted, (2 n - 3) / 2 n for n
     views.
     """
     views = visible.sum(1, keepdim=True)
-    corrected = (squared * (2 * views / (2 * views - 3).clamp_min(1))).where(visible, torch.nan)
-    quartile = _lower_quartile(corrected.flatten(1, 2))
-    if not bool(quartile.isfinite().all()):
-        overall = _lower_quartile(corrected.flatten(1)[..., None]).nan_to_num(nan=1.0)
-        quartile = quartile.where(quartile.isfinite(), overall)
-    return (quartile / _QUARTILE_CHI2_2).clamp_min(_MIN_SIGMA_PX**2)
-
-
-def _lower_quartile(values: Tensor) -> Tensor:
-    """Lower quartile (B, P) of the values (B, n, P) that are not NaN."""
-    ordered = values.sort(dim=1).values
-    last = ordered.shape[1] - 1
-    at = ((values.isfinite() | values.isinf()).sum(1) // 4).clamp_max(last)
-    return ordered.gather(1, at[:, None])[:, 0]
+    corrected = (squared * (2 * views / (2 * views - 3).clamp_min(1))).where(visible, torch.nan).flatten(1, 2)
+    corrected = corrected[:, :: -(-corrected.shape[1] // _MAX_SORTED)]
+    count = (~corrected.isnan()).sum(1, keepdim=True)
+    quartile = corrected.sort(dim=1).values.gather(1, (count // 4).clamp_max(corrected.shape[1] - 1))[:, 0]
+    overall = quartile.where(quartile.isfinite(), torch.nan).nanmedian(1, keepdim=True).values.nan_to_num(nan=1.0)
+    return (quartile.where(quartile.isfinite(), overall) / _QUARTILE_CHI2_2).clamp_min(_MIN_SIGMA_PX**2)
 
 
 def _truncated_moment(cut: float) -> float:

@@ -6,10 +6,16 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from torchstickcal.pipeline.initialise.views import Array, Views, spread
 
 _RANSAC_CONFIDENCE = 0.9999
+_MAX_ROUNDS = 1000
+_PATIENT_ROUNDS = 20_000
+"""Rounds of RANSAC, and rounds where few points are inliers: five that are have then to be drawn together."""
+_FEW_INLIERS = 0.5
+"""Share of inliers below which RANSAC is run again with more points and rounds."""
 _MAX_COUNTED_POINTS = 1000
 """Number of points among which the inliers are counted."""
 _MIN_POINTS = 8
@@ -57,10 +63,12 @@ def relate(views: Views, first: int, second: int, *, max_points: int, threshold_
     a, b = a[:, seen.all(0)], b[:, seen.all(0)]
     threshold = threshold_px / float(np.sqrt(views.focal_px[first] * views.focal_px[second]))
     sample = spread(a.shape[1], max_points)
-    essential = _essential_matrix(a[:, sample], b[:, sample], threshold)
+    essential, inliers = _fitted(a, b, sample, threshold, _MAX_ROUNDS)
+    if len(inliers) < _FEW_INLIERS * a.shape[1]:
+        patient, more = _fitted(a, b, spread(a.shape[1], _MAX_COUNTED_POINTS), threshold, _PATIENT_ROUNDS)
+        essential, inliers = (patient, more) if len(more) > len(inliers) else (essential, inliers)
     if essential is None:
         return Pair(len(columns), 0, ())
-    inliers = np.flatnonzero(_sampson_distance(essential, a, b) < threshold)
     sampled_inliers = inliers[spread(len(inliers), max_points)]
     poses = _decompose(essential, a[:, sampled_inliers], b[:, sampled_inliers])
     share_in_front = poses[0].in_front / max(1, len(sampled_inliers))
@@ -78,13 +86,18 @@ def two_view_depths(rotation: Array, translation: Array, a: Array, b: Array) -> 
     return (ab * bt - bb * at) / determinant, (aa * bt - ab * at) / determinant
 
 
-def _essential_matrix(a: Array, b: Array, threshold: float) -> Array | None:
-    if a.shape[1] < _MIN_POINTS:
-        return None
-    essential, _ = cv2.findEssentialMat(
-        np.ascontiguousarray(a.T), np.ascontiguousarray(b.T), np.eye(3), cv2.USAC_ACCURATE, _RANSAC_CONFIDENCE, threshold
-    )
-    return None if essential is None or essential.shape[0] < 3 else np.asarray(essential[:3], dtype=np.float64)
+def _fitted(
+    a: Array, b: Array, sample: NDArray[np.intp], threshold: float, rounds: int
+) -> tuple[Array | None, NDArray[np.intp]]:
+    """The essential matrix of a sample of the points, and the indices of its inliers among all; None and none if none fits."""
+    if len(sample) < _MIN_POINTS:
+        return None, np.zeros(0, np.intp)
+    first, second = (np.ascontiguousarray(rays[:, sample].T) for rays in (a, b))
+    found, _ = cv2.findEssentialMat(first, second, np.eye(3), cv2.USAC_ACCURATE, _RANSAC_CONFIDENCE, threshold, rounds)
+    if found is None or found.shape[0] < 3:
+        return None, np.zeros(0, np.intp)
+    essential = np.asarray(found[:3], dtype=np.float64)
+    return essential, np.flatnonzero(_sampson_distance(essential, a, b) < threshold)
 
 
 def _sampson_distance(essential: Array, a: Array, b: Array) -> Array:

@@ -106,7 +106,7 @@ def triangulate(
     identity = products.new_tensor(IDENTITY)[:, None]
     current = weights
     if start is not None:
-        current = weights / (1 + _squared_residuals(rotations, translations, rays, start) / scale**2).square()
+        current = weights / (1 + _squared_residuals(rotations, translations, rays, start) / scale / scale).square()
     points = rays.new_zeros(3, rays.shape[2])
     for _ in range(iterations):
         hessian = torch.where(unseen, identity, (products * current[:, None]).sum(0))
