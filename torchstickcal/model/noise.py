@@ -13,8 +13,8 @@ from torchstickcal.model.measurements import Measurements
 from torchstickcal.model.state import State
 
 _CUT = 2.5
-"""Residual, in standard deviations, beyond which a keypoint takes no part in the estimate of the noise. With a wide cut, outliers
-raise the estimate, it lets more of them in, and stays at several times the noise."""
+"""Residual, in standard deviations, beyond which a keypoint takes no part in the estimate of the noise. With a wide cut,
+outliers raise the estimate, it lets more of them in, and stays at several times the noise."""
 _ITERATIONS = 3
 _MAX_SORTED = 5000
 """Residuals of a point, evenly spaced in time, whose quartile is taken."""
@@ -30,8 +30,8 @@ _MIN_VARIANCE_RATIO = 0.01
 def estimate_sigma_px(measurements: Measurements, squared_residuals: Tensor) -> Tensor:
     """Standard deviation of the keypoints along an image axis, for each point, (B, P), pixels.
 
-    It is the root mean square of the residuals below 2.5 standard deviations, corrected for this cut and for the three degrees of
-    freedom of each 3D point. The estimates of different points are then shrunk towards their common mean (empirical Bayes on
+    It is the root mean square of the residuals below 2.5 standard deviations, corrected for this cut and for the three degrees
+    of freedom of each 3D point. The estimates of different points are then shrunk towards their common mean (empirical Bayes on
     the log variances). If their differences can be explained by chance, all points get the same value. Of a long session, 2000
     evenly spaced frames are used.
 

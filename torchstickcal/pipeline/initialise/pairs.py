@@ -19,6 +19,7 @@ _FEW_INLIERS = 0.5
 _MAX_COUNTED_POINTS = 1000
 """Number of points among which the inliers are counted."""
 _MIN_POINTS = 8
+_SUFFICIENT_PARALLAX_RAD = 0.1
 
 
 @dataclass(frozen=True)
@@ -44,8 +45,15 @@ class Pair:
     inliers: int
     """estimated number of common points that fit the essential matrix and lie in front of both cameras; with a wrong matrix,
     many points lie behind a camera"""
+    parallax_rad: float
+    """median angle between the two rays to an inlier; without parallax, the direction of the baseline is not determined"""
     poses: tuple[RelativePose, ...]
     """the four poses, ordered by decreasing number of points in front of both cameras; empty if no essential matrix fits"""
+
+    @property
+    def strength(self) -> float:
+        """Number of inliers that the pair is worth as a part of the rig: fewer where it has little parallax."""
+        return self.inliers * min(1.0, self.parallax_rad / _SUFFICIENT_PARALLAX_RAD)
 
 
 def relate(views: Views, first: int, second: int, *, max_points: int, threshold_px: float) -> Pair:
@@ -68,11 +76,12 @@ def relate(views: Views, first: int, second: int, *, max_points: int, threshold_
         patient, more = _fitted(a, b, spread(a.shape[1], _MAX_COUNTED_POINTS), threshold, _PATIENT_ROUNDS)
         essential, inliers = (patient, more) if len(more) > len(inliers) else (essential, inliers)
     if essential is None:
-        return Pair(len(columns), 0, ())
+        return Pair(len(columns), 0, 0.0, ())
     sampled_inliers = inliers[spread(len(inliers), max_points)]
     poses = _decompose(essential, a[:, sampled_inliers], b[:, sampled_inliers])
     share_in_front = poses[0].in_front / max(1, len(sampled_inliers))
-    return Pair(len(columns), round(len(columns) * share_in_front * len(inliers) / a.shape[1]), poses)
+    fitting = round(len(columns) * share_in_front * len(inliers) / a.shape[1])
+    return Pair(len(columns), fitting, _parallax(poses[0].rotation, a[:, sampled_inliers], b[:, sampled_inliers]), poses)
 
 
 def two_view_depths(rotation: Array, translation: Array, a: Array, b: Array) -> tuple[Array, Array]:
@@ -117,6 +126,15 @@ def _decompose(essential: Array, a: Array, b: Array) -> tuple[RelativePose, ...]
             in_front = int(((sign * depth_a > 0) & (sign * depth_b > 0)).sum())
             poses.append(RelativePose(rotation, sign * direction[:, 0], in_front))
     return tuple(sorted(poses, key=lambda pose: -pose.in_front))
+
+
+def _parallax(rotation: Array, a: Array, b: Array) -> float:
+    """Median angle between the rays to the same points, radians."""
+    if not a.shape[1]:
+        return 0.0
+    first, second = rotation @ _homogeneous(a), _homogeneous(b)
+    sine = np.linalg.norm(np.cross(first, second, axis=0), axis=0)
+    return float(np.median(np.arctan2(sine, (first * second).sum(0))))
 
 
 def _homogeneous(rays: Array) -> Array:

@@ -27,7 +27,9 @@ def triangulate_robustly(
     """
     points = triangulate(rotations, translations, rays, weights, scale=scale)
     of_points = torch.as_tensor(scale, dtype=rays.dtype, device=rays.device).expand(rays.shape[2])
-    contradicted = (_squared_residuals(rotations, translations, rays, points) > (_DOUBTFUL * of_points).square()) & (weights > 0)
+    contradicted = (_squared_residuals(rotations, translations, rays, points) > (_DOUBTFUL * of_points).square()) & (
+        weights > 0
+    )
     doubtful = (contradicted.any(0) & ((weights > 0).sum(0) > 2)).nonzero().flatten()
     if not len(doubtful):
         return points
