@@ -99,6 +99,7 @@ def propagate(edges: Sequence[Edge], views: Views, scale: float) -> tuple[Array,
     _, rotations, translations = max(rigs, key=lambda rig: rig[0])
     _place_again(rotations, translations, rays, visible, scale)
     from_first = rotations @ rotations[0].T
+    from_first[0] = np.eye(3)
     return from_first, translations - from_first @ translations[0]
 
 
