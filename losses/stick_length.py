@@ -11,6 +11,7 @@ from torch import Tensor
 from torchstickcal.geometry.symmetric import DIAGONAL, expand, outer
 from torchstickcal.losses.frame import FrameLoss, FrameTerms
 from torchstickcal.losses.registry import LossContext, LossSettings, register_loss
+from torchstickcal.losses.robust import robust_kernel
 from torchstickcal.precision import in_common_precision, in_full_precision
 from torchstickcal.settings import Positive
 
@@ -111,13 +112,18 @@ class StickLengthSettings(LossSettings):
 
     Args:
         sigma_m: tolerance of the length, metres; ``stick`` takes each stick's own, :attr:`torchstickcal.Stick.sigma_m`.
+        kernel: robust kernel, for frames in which an end is taken from wrong keypoints.
+        kernel_scale: residual in tolerances from which on a frame counts for less; None for the kernel's default.
         weight: factor on the loss.
     """
 
     sigma_m: Positive | Literal["stick"] = "stick"
+    kernel: Literal["none", "cauchy", "huber", "geman_mcclure"] = "none"
+    kernel_scale: Positive | None = None
     weight: Positive = 1.0
 
     loss = StickLengthLoss
 
     def build(self, context: LossContext) -> StickLengthLoss:
-        return StickLengthLoss(context.stick_sigma_m if self.sigma_m == "stick" else self.sigma_m, self.weight)
+        sigma_m = context.stick_sigma_m if self.sigma_m == "stick" else self.sigma_m
+        return StickLengthLoss(sigma_m, self.weight, robust_kernel(self.kernel, self.kernel_scale))

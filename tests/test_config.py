@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -32,7 +33,9 @@ def test_extending_changes_only_what_is_said(tmp_path: Path):
         'extends = "default"\n[stages.metric]\nstick_length = { sigma_m = 0.002 }\n[stages.trajectories]\nsmoothness = false\n'
     )
     mine, default = load_config(file), load_config("default")
-    assert mine.stages["metric"].losses["stick_length"] == StickLengthSettings(sigma_m=0.002)
+    given = default.stages["metric"].losses["stick_length"]
+    assert isinstance(given, StickLengthSettings)
+    assert mine.stages["metric"].losses["stick_length"] == replace(given, sigma_m=0.002)
     assert mine.stages["metric"].losses["reprojection"] == default.stages["metric"].losses["reprojection"]
     assert "smoothness" not in mine.stages["trajectories"].losses
     assert list(mine.stages) == list(default.stages)

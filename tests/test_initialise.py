@@ -44,7 +44,7 @@ def test_spanning_tree_has_the_strongest_pairs_and_relates_only_the_necessary_on
 
     def relate(first: int, second: int) -> Pair:
         related.append((first, second))
-        return Pair(int(common[first, second]), inliers[first, second], (pose,))
+        return Pair(int(common[first, second]), inliers[first, second], 1.0, (pose,))
 
     edges = spanning_tree(common, relate, ["a", "b", "c", "d"], 20)
     assert [(edge.parent, edge.child) for edge in edges] == [(0, 1), (1, 2), (2, 3)]

@@ -23,6 +23,9 @@ ROLLING = replace(SPEC, clocks=Clocks(0.5 / FPS, readout_s=0.01))
 OUTPUTS = ("time_offsets", "readout", "translations", "points")
 
 
+EVERY_KEYPOINT: dict[str, Any] = {name: {"reject_sigmas": False} for name in ("metric", "selected", "refined", "trajectories")}
+
+
 def config(*refine: str) -> dict[str, Any]:
     return {"extends": "default", "refine": list(refine)}
 
@@ -30,7 +33,7 @@ def config(*refine: str) -> dict[str, Any]:
 def layer_of(session: SimulatedSession, *refine: str) -> CalibrationLayer:
     """With known noise and all keypoints, so that only the motion counts as a constant."""
     known = {"reprojection": {"sigma_px": 1.0}, "reject_sigmas": False}
-    stages: dict[str, Any] = {"unscaled": known, "metric": known, "refined": known}
+    stages: dict[str, Any] = {"unscaled": known, "metric": known, "selected": known, "refined": known}
     stages["trajectories"] = known | {"smoothness": {"sigma_m": 0.1}}
     return CalibrationLayer(session.observations.sticks, config(*refine) | {"stages": stages})
 
@@ -98,7 +101,7 @@ def test_a_batch_gives_what_its_sessions_give():
 
 def test_a_warm_start_leads_to_the_same_place_from_the_clocks_found():
     session = SPEC.generate()
-    layer = CalibrationLayer(session.observations.sticks, config("time_offset"))
+    layer = CalibrationLayer(session.observations.sticks, config("time_offset") | {"stages": EVERY_KEYPOINT})
     before, cold = run(layer, session, session.observations.keypoints + 0.5), run(layer, session)
     failed = replace(before, converged=torch.zeros_like(before.converged))
     tenth_of_deviation = (

@@ -37,7 +37,7 @@ KINDS = {
 def config(*refine: str) -> dict[str, Any]:
     """The default with known noise and all keypoints, so that the whole is a differentiable function of its input."""
     known = {"reprojection": {"sigma_px": 1.0}, "reject_sigmas": False}
-    stages: dict[str, Any] = {"unscaled": known, "metric": known, "refined": known}
+    stages: dict[str, Any] = {"unscaled": known, "metric": known, "selected": known, "refined": known}
     stages["trajectories"] = known | {"smoothness": {"sigma_m": 0.1}}
     return {"extends": "default", "stages": stages, "refine": list(refine), "camera_groups": list("aabb")}
 

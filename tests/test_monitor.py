@@ -29,7 +29,7 @@ def test_log_has_every_iteration_of_every_stage(tmp_path: Path, noisy):
         }.items():
             assert [event.value for event in log.Scalars(f"{prefix}/{name}")] == pytest.approx(values, rel=1e-6)
     assert "2 metric/loss/stick_length" in tags["scalars"]
-    assert "4 trajectories/loss/smoothness" in tags["scalars"]
+    assert "5 trajectories/loss/smoothness" in tags["scalars"]
     assert tags["images"] == ["rig"]
     assert tags["tensors"] == ["summary/text_summary"]
 

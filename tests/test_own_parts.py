@@ -131,9 +131,9 @@ def registered(own_parts) -> None:
 
 
 def with_stage_losses(**losses: Any) -> dict[str, Any]:
-    """The default with more losses, and with known noise, so that both solvers minimise the same."""
+    """The default with more losses, with known noise and all keypoints, so that both solvers minimise the same."""
     known = {"reprojection": {"sigma_px": 2.0}}
-    later = dict.fromkeys(("metric", "refined", "trajectories"), known | losses)
+    later = dict.fromkeys(("metric", "selected", "refined", "trajectories"), known | {"reject_sigmas": False} | losses)
     return {"extends": "default", "stages": {"unscaled": known} | later}
 
 
@@ -157,7 +157,7 @@ class TestLoss:
         assert newton.converged
         assert forearm_difference_m(plain) > 0.005
         assert forearm_difference_m(newton) < 1e-6
-        costs = [calibration.stages[2].iterations[-1].cost for calibration in (newton, lbfgs)]
+        costs = [calibration.stages[3].iterations[-1].cost for calibration in (newton, lbfgs)]
         assert costs[0] == pytest.approx(costs[1], rel=1e-6)
         torch.testing.assert_close(newton.translations, lbfgs.translations, rtol=0, atol=1e-4)
 
@@ -176,7 +176,7 @@ class TestLoss:
         calibrate(observations, with_stage_losses(own_forearms={}), TensorBoardMonitor(tmp_path))
         log = EventAccumulator(str(tmp_path))
         log.Reload()
-        assert "3 refined/loss/own_forearms" in log.Tags()["scalars"]
+        assert "4 refined/loss/own_forearms" in log.Tags()["scalars"]
 
     def test_unknown_settings_and_taken_names_are_refused(self):
         with pytest.raises(ConfigError, match=r"own_forearms.sigma.*Did you mean 'sigma_m'"):
@@ -373,7 +373,7 @@ class TestCameraUnknown:
         given = self.observations()
         keypoints = given.keypoints[:, :12].clone().requires_grad_()
         known = {"reprojection": {"sigma_px": 0.5}, "reject_sigmas": False}
-        stages = dict.fromkeys(("unscaled", "metric", "refined"), known)
+        stages = dict.fromkeys(("unscaled", "metric", "selected", "refined"), known)
         stages["trajectories"] = known | {"smoothness": {"sigma_m": 0.1}}
         layer = CalibrationLayer(given.sticks, {"extends": "default", "refine": ["own_aspect"], "stages": stages})
         result = layer(keypoints, given.cameras)

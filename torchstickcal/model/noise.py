@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import math
-
 import torch
 from torch import Tensor
 
@@ -12,12 +10,15 @@ from torchstickcal.losses.track import combined, consecutive
 from torchstickcal.model.measurements import Measurements
 from torchstickcal.model.state import State
 
-_CUT = 4.0
-"""Residual, in standard deviations, beyond which a keypoint counts as an outlier in the estimate of the noise."""
-_ITERATIONS = 5
+_CUT = 2.5
+"""Residual, in standard deviations, beyond which a keypoint takes no part in the estimate of the noise. With a wide cut,
+outliers raise the estimate, it lets more of them in, and stays at several times the noise."""
+_ITERATIONS = 4
+_MAX_SORTED = 5000
+"""Residuals of a point, evenly spaced in time, whose quartile is taken."""
 _MAX_FRAMES = 2000
-_MEDIAN_CHI2_2 = 2 * math.log(2)
-"""Median of the chi-square distribution with 2 degrees of freedom."""
+_LOWER_QUARTILE = -0.6745
+"""Of the standard normal distribution."""
 _MIN_SIGMA_PX = 1e-4
 _MIN_ACCELERATION_M = 1e-5
 _MIN_VARIANCE_RATIO = 0.01
@@ -27,8 +28,8 @@ _MIN_VARIANCE_RATIO = 0.01
 def estimate_sigma_px(measurements: Measurements, squared_residuals: Tensor) -> Tensor:
     """Standard deviation of the keypoints along an image axis, for each point, (B, P), pixels.
 
-    It is the root mean square of the residuals below 4 standard deviations, corrected for this cut and for the three degrees of
-    freedom of each 3D point. The estimates of different points are then shrunk towards their common mean (empirical Bayes on
+    It is the root mean square of the residuals below 2.5 standard deviations, corrected for this cut and for the three degrees
+    of freedom of each 3D point. The estimates of different points are then shrunk towards their common mean (empirical Bayes on
     the log variances). If their differences can be explained by chance, all points get the same value. Of a long session, 2000
     evenly spaced frames are used.
 
@@ -39,13 +40,16 @@ def estimate_sigma_px(measurements: Measurements, squared_residuals: Tensor) -> 
     frames = torch.linspace(0, measurements.frames - 1, min(measurements.frames, _MAX_FRAMES)).round().long()
     visible = measurements.by_frame(measurements.visible)[:, :, frames]
     squared = measurements.by_frame(squared_residuals)[:, :, frames].double()
-    variance = _initial_variance(squared, visible)
+    variance, views = _initial_variance(squared, visible), visible.sum(1)
+    moments = _truncated_moments(measurements.num_cameras).to(squared)
     for _ in range(_ITERATIONS):
-        inliers = visible & (squared <= _CUT**2 * variance[:, None, None])
+        inliers = visible & (squared <= (_CUT**2 * variance[:, None] * _remaining_share(views))[:, None])
         inliers = inliers & (inliers.sum(1, keepdim=True) >= 2)
-        degrees_of_freedom = (2 * inliers.sum(1) - 3).clamp_min(0).sum(1).to(squared)
-        sums = squared.where(inliers, 0.0).sum((1, 2))
-        variance = sums / degrees_of_freedom.clamp_min(1) / _truncated_moment(_CUT)
+        views = inliers.sum(1)
+        by_point = (2 * views - 3).clamp_min(0)
+        degrees_of_freedom = by_point.sum(1).to(squared)
+        expected = (by_point * moments[views]).sum(1).clamp_min(moments[2])
+        variance = squared.where(inliers, 0.0).sum((1, 2)) / expected
         variance = _shrink(variance.clamp_min(_MIN_SIGMA_PX**2), degrees_of_freedom)
     return variance.sqrt()
 
@@ -97,24 +101,46 @@ def estimate_acceleration_m(measurements: Measurements, points: Tensor, point_va
 
 
 def _initial_variance(squared: Tensor, visible: Tensor) -> Tensor:
-    """Variance (B, P) from the median of the squared residuals.
+    """Variance (B, P) from the lower quartile of the squared residuals, which the better keypoints determine.
 
     Each squared residual is first divided by the fraction that remains after its 3D point was fitted, (2 n - 3) / 2 n for n
     views.
     """
     views = visible.sum(1, keepdim=True)
-    corrected = (squared * (2 * views / (2 * views - 3).clamp_min(1))).where(visible, torch.nan)
-    median = corrected.flatten(1, 2).nanmedian(1).values
-    if not bool(median.isfinite().all()):
-        overall = corrected.flatten(1).nanmedian(1, keepdim=True).values.nan_to_num(nan=1.0)
-        median = median.where(median.isfinite(), overall)
-    return (median / _MEDIAN_CHI2_2).clamp_min(_MIN_SIGMA_PX**2)
+    quartiles = _lower_quartiles(visible.shape[1]).to(squared)
+    corrected = (squared / (_remaining_share(views) * quartiles[views])).where(visible, torch.nan).flatten(1, 2)
+    corrected = corrected[:, :: -(-corrected.shape[1] // _MAX_SORTED)]
+    count = (~corrected.isnan()).sum(1, keepdim=True)
+    quartile = corrected.sort(dim=1).values.gather(1, (count // 4).clamp_max(corrected.shape[1] - 1))[:, 0]
+    overall = quartile.where(quartile.isfinite(), torch.nan).nanmedian(1, keepdim=True).values.nan_to_num(nan=1.0)
+    return quartile.where(quartile.isfinite(), overall).clamp_min(_MIN_SIGMA_PX**2)
 
 
-def _truncated_moment(cut: float) -> float:
-    """Second moment of a two-dimensional Gaussian inside a radius of ``cut`` sigma, as a fraction of the full moment."""
-    tail = math.exp(-(cut**2) / 2)
-    return 1 - (cut**2 / 2) * tail / (1 - tail)
+def _remaining_share(views: Tensor) -> Tensor:
+    """Fraction of a keypoint's variance that its residual has after its 3D point was fitted to n views: (2 n - 3) / 2 n."""
+    return (2 * views - 3).clamp_min(1) / (2 * views).clamp_min(4)
+
+
+def _truncated_moments(cameras: int) -> Tensor:
+    """Second moments of residuals below the cut, as fractions of the full moments, by the number of views from 0 to C."""
+    half = _degrees(cameras) / 2
+    limit = half * _CUT**2 / 2
+    return torch.special.gammainc(half + 1, limit) / torch.special.gammainc(half, limit)
+
+
+def _lower_quartiles(cameras: int) -> Tensor:
+    """Lower quartiles of squared residuals with mean 2, by the number of views from 0 to C (Wilson and Hilferty 1931)."""
+    spread = 2 / (9 * _degrees(cameras))
+    return 2 * (1 - spread + _LOWER_QUARTILE * spread.sqrt()) ** 3
+
+
+def _degrees(cameras: int) -> Tensor:
+    """Degrees of freedom of the chi-square distribution that squared residuals have, by the number of views from 0 to C.
+
+    The residual of a keypoint has two coordinates. With two views only the distance from the epipolar line remains of them: one
+    degree of freedom. With many views it has two.
+    """
+    return 2 - 1 / (torch.arange(cameras + 1, dtype=torch.float64) - 1).clamp_min(1)
 
 
 def _shrink(variance: Tensor, degrees_of_freedom: Tensor) -> Tensor:

@@ -13,7 +13,7 @@ from torchstickcal.model.measurements import Measurements
 from torchstickcal.model.state import State
 from torchstickcal.pipeline.initialise.graph import propagate, spanning_tree
 from torchstickcal.pipeline.initialise.pairs import relate
-from torchstickcal.pipeline.initialise.triangulate import triangulate
+from torchstickcal.pipeline.initialise.triangulate import triangulate_robustly
 from torchstickcal.pipeline.initialise.views import Views
 
 __all__ = ["initialise", "triangulated"]
@@ -56,7 +56,7 @@ def triangulated(measurements: Measurements, rotations: Tensor, translations: Te
         pixels = measurements.pixels[0][..., columns].double().movedim(1, -1)
         rays = measurements.cameras[0].undistort(pixels).movedim(-1, 1)
         weights = measurements.confidence[0][:, columns].double() * rays.isfinite().all(1)
-        chunk = triangulate(rotations[0], translations[0], rays.nan_to_num(), weights, scale=scale)
+        chunk = triangulate_robustly(rotations[0], translations[0], rays.nan_to_num(), weights, scale=scale)
         points[0, :, columns] = chunk.nan_to_num()
     return points
 

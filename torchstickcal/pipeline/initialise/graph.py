@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
+import cv2
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
 from torchstickcal.errors import RigError
 from torchstickcal.pipeline.initialise.pairs import Pair, RelativePose, two_view_depths
-from torchstickcal.pipeline.initialise.triangulate import triangulate
+from torchstickcal.pipeline.initialise.triangulate import triangulate, triangulate_robustly
 from torchstickcal.pipeline.initialise.views import Array, Views, spread
 
 _PLAUSIBLE_SHARE = 0.5
@@ -19,6 +21,11 @@ _PLAUSIBLE_SHARE = 0.5
 _SUFFICIENT_INLIERS = 0.9
 """Inliers over common points from which a pair joins the tree without comparison with other pairs."""
 _MAX_POINTS = 400
+_SOUND_SHARE = 0.6
+"""Support of a camera below which it is placed again."""
+_CLEAR_GAIN = 0.05
+"""Gain of support from which the new place is better."""
+_PLACING_ROUNDS, _PNP_ROUNDS, _MIN_POINTS = 3, 300, 12
 
 
 class Edge(NamedTuple):
@@ -32,11 +39,11 @@ class Edge(NamedTuple):
 def spanning_tree(
     common: NDArray[np.int_], relate: Callable[[int, int], Pair], labels: Sequence[str], min_common: int
 ) -> list[Edge]:
-    """Edges of the maximum spanning tree over the inlier counts, from the first camera on (Prim's algorithm).
+    """Edges of the maximum spanning tree over the strengths of the pairs, from the strongest pair on (Prim's algorithm).
 
-    To relate a pair is the expensive step. The number of common points is an upper bound for the number of inliers. So a pair
-    is related only if no other pair that could join the tree has a higher bound or count. A pair of which almost all points are
-    inliers joins the tree at once.
+    To relate a pair is the expensive step. The number of common points is an upper bound for the strength. So a pair is
+    related only if no other pair that could join the tree has a higher bound or strength. A pair of which almost all points are
+    inliers, with sufficient parallax, joins the tree at once.
 
     Args:
         common: number of common points of each pair, (C, C).
@@ -47,35 +54,37 @@ def spanning_tree(
     Raises:
         RigError: if a camera cannot be connected. The message names it and the pairs with too few points.
     """
-    cameras = range(len(labels))
-    placed, edges, related = {0}, list[Edge](), dict[tuple[int, int], Pair]()
+    pairs = list(itertools.combinations(range(len(labels)), 2))
+    placed, edges, related = set[int](), list[Edge](), dict[tuple[int, int], Pair]()
     while len(placed) < len(labels):
-        crossing = [(i, j) for i in cameras for j in cameras if i < j and (i in placed) != (j in placed)]
-        bounds = {pair: related[pair].inliers if pair in related else int(common[pair]) for pair in crossing}
-        best = max(crossing, key=lambda pair: bounds[pair])
-        if bounds[best] < min_common:
-            raise _disconnected({pair: int(common[pair]) for pair in crossing}, placed, labels, min_common)
+        crossing = [(i, j) for i, j in pairs if not placed or (i in placed) != (j in placed)]
+        usable = [pair for pair in crossing if (related[pair].inliers if pair in related else common[pair]) >= min_common]
+        if not usable:
+            raise _disconnected({pair: int(common[pair]) for pair in crossing}, placed or {0}, labels, min_common)
+        bounds = {pair: related[pair].strength if pair in related else float(common[pair]) for pair in usable}
+        best = max(usable, key=lambda pair: bounds[pair])
         if best not in related:
             related[best] = relate(*best)
-            if related[best].inliers < _SUFFICIENT_INLIERS * related[best].common:
+            if related[best].strength < _SUFFICIENT_INLIERS * related[best].common:
                 continue
         poses = related[best].poses
-        if best[0] in placed:
+        if best[0] in placed or not placed:
             edges.append(Edge(best[0], best[1], poses))
         else:
             edges.append(Edge(best[1], best[0], tuple(pose.inverse() for pose in poses)))
-        placed.add(edges[-1].child)
+        placed |= set(best)
     return edges
 
 
 def propagate(edges: Sequence[Edge], views: Views, scale: float) -> tuple[Array, Array]:
-    """Rotations (C, 3, 3) and translations (C, 3) of all cameras, in the frame of the first. The first edge has length 1.
+    """Rotations (C, 3, 3) and translations (C, 3) of all cameras, in the frame of camera 0. The first edge has length 1.
 
     An essential matrix allows four poses. The number of points in front of both cameras does not always identify the true pose
     among them: the twisted pair can have as many. A third camera decides, because the wrong pose projects the points elsewhere
     in it. So the cameras are placed once for every plausible pose of the first edge. At each further edge, the pose with the
-    largest support by the points known so far is used. The rig with the largest total support is returned. A few hundred
-    points, evenly spaced in the session, are sufficient.
+    largest support by the points known so far is used. Of these rigs, the one with the largest total support is kept, and each
+    of its cameras that the points of the others contradict is placed again. A few hundred points, evenly spaced in the session,
+    are sufficient.
 
     Args:
         edges: the spanning tree.
@@ -88,7 +97,71 @@ def propagate(edges: Sequence[Edge], views: Views, scale: float) -> tuple[Array,
     plausible = [pose for pose in first if pose.in_front >= _PLAUSIBLE_SHARE * first[0].in_front]
     rigs = [_place_cameras(root, edges, rays, visible, scale) for root in plausible]
     _, rotations, translations = max(rigs, key=lambda rig: rig[0])
-    return rotations, translations
+    _place_again(rotations, translations, rays, visible, scale)
+    from_first = rotations @ rotations[0].T
+    from_first[0] = np.eye(3)
+    return from_first, translations - from_first @ translations[0]
+
+
+def _place_again(rotations: Array, translations: Array, rays: Array, visible: NDArray[np.bool_], scale: float) -> None:
+    """Place cameras anew, in place, by the points of all others, the least supported first (perspective-n-point, RANSAC)."""
+    cameras = range(len(rays))
+    for _ in range(_PLACING_ROUNDS if len(rays) > 2 else 0):
+        supports = [_supported(c, rotations, translations, rays, visible, scale) for c in cameras]
+        doubtful = [c for c in sorted(cameras, key=lambda c: supports[c].share) if supports[c].share < _SOUND_SHARE]
+        if not doubtful:
+            return
+        for camera in doubtful:
+            before = _supported(camera, rotations, translations, rays, visible, scale)
+            if len(before.seen) < _MIN_POINTS:
+                continue
+            points, image = before.known[:, before.seen].T, rays[camera][:, before.seen].T
+            found, turn, shift, _ = cv2.solvePnPRansac(
+                np.ascontiguousarray(points), np.ascontiguousarray(image), np.eye(3), None,
+                iterationsCount=_PNP_ROUNDS, reprojectionError=scale / 2, confidence=0.9999, flags=cv2.SOLVEPNP_SQPNP,
+            )  # fmt: skip
+            if not found or not (np.isfinite(turn).all() and np.isfinite(shift).all()):
+                continue
+            kept = rotations[camera].copy(), translations[camera].copy()
+            rotations[camera], translations[camera] = cv2.Rodrigues(turn)[0], shift[:, 0]
+            if _supported(camera, rotations, translations, rays, visible, scale).share < before.share + _CLEAR_GAIN:
+                rotations[camera], translations[camera] = kept
+
+
+class _Support(NamedTuple):
+    """How well a camera agrees with the points that the others see."""
+
+    share: float
+    """mean kernel weight of its keypoints, 0 to 1"""
+    known: Array
+    """(3, n), the points by the other cameras; NaN where not known"""
+    seen: NDArray[np.intp]
+    """the known points that it sees"""
+
+
+def _supported(
+    camera: int, rotations: Array, translations: Array, rays: Array, visible: NDArray[np.bool_], scale: float
+) -> _Support:
+    """The support of a camera by the points of all others."""
+    others = [other for other in range(len(rays)) if other != camera]
+    known = triangulate_robustly(
+        torch.from_numpy(rotations[others]),
+        torch.from_numpy(translations[others]),
+        torch.from_numpy(rays[others]),
+        torch.from_numpy(visible[others]).double(),
+        scale=scale,
+    ).numpy()
+    seen = np.flatnonzero(visible[camera] & np.isfinite(known).all(0))
+    weights = _kernel_weights(rotations[camera], translations[camera], known[:, seen], rays[camera][:, seen], scale)
+    return _Support(float(weights.mean()) if len(seen) else 1.0, known, seen)
+
+
+def _kernel_weights(rotation: Array, translation: Array, points: Array, rays: Array, scale: float) -> Array:
+    """Weights (n,) of keypoints by their distance from the projections of points (3, n); zero behind the camera."""
+    x, y, z = rotation @ points + translation[:, None]
+    z_safe = np.where(np.abs(z) < 1e-9, 1e-9, z)
+    squared = (x / z_safe - rays[0]) ** 2 + (y / z_safe - rays[1]) ** 2
+    return (z > 0) / (1 + squared / scale / scale)
 
 
 def _place_cameras(
@@ -139,10 +212,8 @@ def _place_camera(
     rotation = pose.rotation @ rotations[parent]
     translation = pose.rotation @ translations[parent] + baseline * pose.translation
     seen = np.flatnonzero(visible[child] & np.isfinite(known[0]))
-    x, y, z = rotation @ known[:, seen] + translation[:, None]
-    z_safe = np.where(np.abs(z) < 1e-9, 1e-9, z)
-    squared = (x / z_safe - rays[child, 0, seen]) ** 2 + (y / z_safe - rays[child, 1, seen]) ** 2
-    return float(((z > 0) / (1 + squared / scale**2)).sum()), rotation, translation
+    weights = _kernel_weights(rotation, translation, known[:, seen], rays[child][:, seen], scale)
+    return float(weights.sum()), rotation, translation
 
 
 def _disconnected(common: dict[tuple[int, int], int], placed: set[int], labels: Sequence[str], min_common: int) -> RigError:

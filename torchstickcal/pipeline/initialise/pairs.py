@@ -6,13 +6,20 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from torchstickcal.pipeline.initialise.views import Array, Views, spread
 
 _RANSAC_CONFIDENCE = 0.9999
+_MAX_ROUNDS = 1000
+_PATIENT_ROUNDS = 20_000
+"""Rounds of RANSAC, and rounds where few points are inliers: five that are have then to be drawn together."""
+_FEW_INLIERS = 0.5
+"""Share of inliers below which RANSAC is run again with more points and rounds."""
 _MAX_COUNTED_POINTS = 1000
 """Number of points among which the inliers are counted."""
 _MIN_POINTS = 8
+_SUFFICIENT_PARALLAX_RAD = 0.1
 
 
 @dataclass(frozen=True)
@@ -38,8 +45,15 @@ class Pair:
     inliers: int
     """estimated number of common points that fit the essential matrix and lie in front of both cameras; with a wrong matrix,
     many points lie behind a camera"""
+    parallax_rad: float
+    """median angle between the two rays to an inlier; without parallax, the direction of the baseline is not determined"""
     poses: tuple[RelativePose, ...]
     """the four poses, ordered by decreasing number of points in front of both cameras; empty if no essential matrix fits"""
+
+    @property
+    def strength(self) -> float:
+        """Number of inliers that the pair is worth as a part of the rig: fewer where it has little parallax."""
+        return self.inliers * min(1.0, self.parallax_rad / _SUFFICIENT_PARALLAX_RAD)
 
 
 def relate(views: Views, first: int, second: int, *, max_points: int, threshold_px: float) -> Pair:
@@ -57,14 +71,17 @@ def relate(views: Views, first: int, second: int, *, max_points: int, threshold_
     a, b = a[:, seen.all(0)], b[:, seen.all(0)]
     threshold = threshold_px / float(np.sqrt(views.focal_px[first] * views.focal_px[second]))
     sample = spread(a.shape[1], max_points)
-    essential = _essential_matrix(a[:, sample], b[:, sample], threshold)
+    essential, inliers = _fitted(a, b, sample, threshold, _MAX_ROUNDS)
+    if len(inliers) < _FEW_INLIERS * a.shape[1]:
+        patient, more = _fitted(a, b, spread(a.shape[1], _MAX_COUNTED_POINTS), threshold, _PATIENT_ROUNDS)
+        essential, inliers = (patient, more) if len(more) > len(inliers) else (essential, inliers)
     if essential is None:
-        return Pair(len(columns), 0, ())
-    inliers = np.flatnonzero(_sampson_distance(essential, a, b) < threshold)
+        return Pair(len(columns), 0, 0.0, ())
     sampled_inliers = inliers[spread(len(inliers), max_points)]
     poses = _decompose(essential, a[:, sampled_inliers], b[:, sampled_inliers])
     share_in_front = poses[0].in_front / max(1, len(sampled_inliers))
-    return Pair(len(columns), round(len(columns) * share_in_front * len(inliers) / a.shape[1]), poses)
+    fitting = round(len(columns) * share_in_front * len(inliers) / a.shape[1])
+    return Pair(len(columns), fitting, _parallax(poses[0].rotation, a[:, sampled_inliers], b[:, sampled_inliers]), poses)
 
 
 def two_view_depths(rotation: Array, translation: Array, a: Array, b: Array) -> tuple[Array, Array]:
@@ -78,13 +95,18 @@ def two_view_depths(rotation: Array, translation: Array, a: Array, b: Array) -> 
     return (ab * bt - bb * at) / determinant, (aa * bt - ab * at) / determinant
 
 
-def _essential_matrix(a: Array, b: Array, threshold: float) -> Array | None:
-    if a.shape[1] < _MIN_POINTS:
-        return None
-    essential, _ = cv2.findEssentialMat(
-        np.ascontiguousarray(a.T), np.ascontiguousarray(b.T), np.eye(3), cv2.USAC_ACCURATE, _RANSAC_CONFIDENCE, threshold
-    )
-    return None if essential is None or essential.shape[0] < 3 else np.asarray(essential[:3], dtype=np.float64)
+def _fitted(
+    a: Array, b: Array, sample: NDArray[np.intp], threshold: float, rounds: int
+) -> tuple[Array | None, NDArray[np.intp]]:
+    """The essential matrix of a sample of the points, and the indices of its inliers among all; None and none if none fits."""
+    if len(sample) < _MIN_POINTS:
+        return None, np.zeros(0, np.intp)
+    first, second = (np.ascontiguousarray(rays[:, sample].T) for rays in (a, b))
+    found, _ = cv2.findEssentialMat(first, second, np.eye(3), cv2.USAC_ACCURATE, _RANSAC_CONFIDENCE, threshold, rounds)
+    if found is None or found.shape[0] < 3:
+        return None, np.zeros(0, np.intp)
+    essential = np.asarray(found[:3], dtype=np.float64)
+    return essential, np.flatnonzero(_sampson_distance(essential, a, b) < threshold)
 
 
 def _sampson_distance(essential: Array, a: Array, b: Array) -> Array:
@@ -104,6 +126,15 @@ def _decompose(essential: Array, a: Array, b: Array) -> tuple[RelativePose, ...]
             in_front = int(((sign * depth_a > 0) & (sign * depth_b > 0)).sum())
             poses.append(RelativePose(rotation, sign * direction[:, 0], in_front))
     return tuple(sorted(poses, key=lambda pose: -pose.in_front))
+
+
+def _parallax(rotation: Array, a: Array, b: Array) -> float:
+    """Median angle between the rays to the same points, radians."""
+    if not a.shape[1]:
+        return 0.0
+    first, second = rotation @ _homogeneous(a), _homogeneous(b)
+    sine = np.linalg.norm(np.cross(first, second, axis=0), axis=0)
+    return float(np.median(np.arctan2(sine, (first * second).sum(0))))
 
 
 def _homogeneous(rays: Array) -> Array:
