@@ -17,12 +17,17 @@ from torchstickcal.pipeline.relabel.views import RayViews
 
 __all__ = ["Exchange", "Labels", "exchanges", "mended"]
 
-_GROSS_SIGMAS = 5.0
+_GROSS_SIGMAS = 6.0
+_GROSS_SHARE = 0.2
+"""Least residual of an exchanged keypoint, as a share of its distance to the one that it is exchanged for."""
 _SUSPICIOUS_SHARE = 0.3
 """Share of the keypoints of an exchange that must contradict the points for a camera's frame to be looked at."""
 _MEASURED_FRAMES = 2000
-_QUARTILE_CHI2_2 = 0.5754
-"""Lower quartile of the chi-square distribution with 2 degrees of freedom."""
+_LEAST_NOISE_PX = 0.05
+_SHARE, _QUANTILE_CHI2_2 = 0.1, 0.2107
+"""A share of keypoints that are right even where most labels are wrong, and the chi-square quantile of it, 2 degrees of freedom."""
+_LARGEST_RATIO = 3.0
+"""Of the noise of a point to that of all points."""
 
 
 @dataclass(frozen=True)
@@ -60,6 +65,11 @@ class Labels:
         return replace(self, index=self.index.where(~where[..., None], self.index[..., partner]))
 
     @property
+    def touched(self) -> Tensor:
+        """(B, C, F), True where anything is not as given."""
+        return self.changed.any(-1) | self.other_person
+
+    @property
     def changed(self) -> Tensor:
         """(B, C, F, P), True where a point uses the keypoint that was given for another."""
         return self.index != torch.arange(self.index.shape[-1], device=self.index.device)
@@ -67,7 +77,7 @@ class Labels:
     def applied(self, observations: Observations) -> Observations:
         """The one session that these are of, with its keypoints where they belong."""
         index, other = self.index[0], self.other_person[0]
-        if not (self.changed.any() or other.any()):
+        if not self.touched.any():
             return observations
         keypoints, confidence = observations.keypoints, observations.confidence
         keypoints = keypoints.gather(2, index[..., None].expand(-1, -1, -1, 2))
@@ -83,7 +93,8 @@ def mended(
 ) -> tuple[Labels, Measurements, State]:
     """One session with its label errors undone.
 
-    Nothing but the residuals is looked at where they give no reason for suspicion.
+    Nothing but the residuals is looked at where they give no reason for suspicion. What was found earlier, with cameras that
+    were less well known, is decided anew.
 
     Args:
         labels: as they are so far.
@@ -92,25 +103,67 @@ def mended(
         applied: gives the session with other labels.
 
     Returns:
-        The labels, the session with them, and its points triangulated anew; the given objects where nothing was found.
+        The labels, the session with them, and its points triangulated anew; the given objects where the labels stay.
     """
-    suspicions = _Suspicions.of(measurements, state)
+    given = labels, measurements, state
+    residuals = _Residuals.of(measurements, state)
+    sigma_px = residuals.sigma_px
+
+    def with_labels(new: Labels, frames: Tensor) -> tuple[Labels, Measurements, State]:
+        again = applied(new)
+        return new, again, _triangulated(again, state, sigma_px, frames.nonzero()[:, 0])
+
+    if (touched := labels.touched[0].any(0)).any():
+        labels, measurements, state = with_labels(Labels.as_given(measurements), touched)
+        residuals = _Residuals.of(measurements, state)
     for exchange in exchanges(measurements.point_names, measurements.sticks.tolist()):
-        points = torch.tensor(exchange.pairs, device=labels.index.device).mT.flatten()
-        frames = suspicions.frames(points)
+        points = torch.tensor(exchange.pairs, device=touched.device).mT.flatten()
+        frames = residuals.suspicious(points).nonzero()[:, 0]
         if not len(frames):
             continue
-        views = RayViews.of(measurements, state, suspicions.sigma_px, frames).at(points)
-        where = exchanged_where(views, _pixels(measurements, points), frames)
-        if not where.any():
-            continue
-        partner = torch.arange(measurements.points_per_frame, device=points.device)
-        partner[points] = points.roll(len(exchange.pairs))
-        labels = labels.exchanged(where, partner)
-        measurements = applied(labels)
-        state = _triangulated(measurements, state, suspicions.sigma_px, where.any(0).nonzero()[:, 0])
-        suspicions = _Suspicions.of(measurements, state)
+        views = RayViews.of(measurements, state, sigma_px, frames).at(points)
+        where = exchanged_where(views, residuals.pixels[..., points], frames)
+        if where.any():
+            partner = torch.arange(measurements.points_per_frame, device=points.device)
+            partner[points] = points.roll(len(exchange.pairs))
+            labels, measurements, state = with_labels(labels.exchanged(where, partner), where.any(0))
+            residuals = _Residuals.of(measurements, state)
+    if all(map(torch.equal, (labels.index, labels.other_person), (given[0].index, given[0].other_person))):
+        return given
     return labels, measurements, state
+
+
+@dataclass(frozen=True)
+class _Residuals:
+    """What contradicts what in one session."""
+
+    squared: Tensor
+    """(C, F, P), square pixels, 0 where not seen"""
+    pixels: Tensor
+    """(C, 2, F, P), NaN where not seen"""
+    sigma_px: Tensor
+    """(P,), a cautious estimate of the noise of each point's keypoints"""
+
+    @staticmethod
+    def of(measurements: Measurements, state: State) -> _Residuals:
+        squared = measurements.by_frame(measurements.squared_residuals(state)[0])
+        visible = measurements.by_frame(measurements.visible[0])
+        pixels = measurements.by_frame(measurements.pixels[0]).where(visible[:, None], torch.nan)
+        return _Residuals(squared.where(visible, 0.0), pixels, _noise(squared, visible))
+
+    def suspicious(self, points: Tensor) -> Tensor:
+        """The frames (F,) in which keypoints of one camera contradict their points as much as if they were exchanged.
+
+        Args:
+            points: those that may be exchanged, each half of them for the other.
+        """
+        squared, pixels = self.squared[..., points], self.pixels[..., points]
+        gross = squared > (_GROSS_SIGMAS * self.sigma_px[points]).square()
+        if not gross.any():
+            return gross.any(-1).any(0)
+        apart = (pixels - pixels.roll(len(points) // 2, -1)).square().sum(1).nan_to_num()
+        gross &= squared > _GROSS_SHARE**2 * apart
+        return (gross.sum(-1) > _SUSPICIOUS_SHARE * pixels[:, 0].isfinite().sum(-1)).any(0)
 
 
 def _triangulated(measurements: Measurements, state: State, sigma_px: Tensor, frames: Tensor) -> State:
@@ -120,40 +173,15 @@ def _triangulated(measurements: Measurements, state: State, sigma_px: Tensor, fr
     return replace(state, points=points.flatten(1)[None])
 
 
-@dataclass(frozen=True)
-class _Suspicions:
-    """Which keypoints of one session grossly contradict the points."""
-
-    gross: Tensor
-    """(C, F, P)"""
-    visible: Tensor
-    """(C, F, P)"""
-    sigma_px: Tensor
-    """(P,), a cautious estimate of the noise of each point's keypoints"""
-
-    @staticmethod
-    def of(measurements: Measurements, state: State) -> _Suspicions:
-        squared = measurements.by_frame(measurements.squared_residuals(state)[0])
-        visible = measurements.by_frame(measurements.visible[0])
-        sigma_px = _noise(squared, visible)
-        return _Suspicions(visible & (squared > (_GROSS_SIGMAS * sigma_px).square()), visible, sigma_px)
-
-    def frames(self, points: Tensor) -> Tensor:
-        """The frames in which many keypoints of some points in one camera are gross."""
-        gross, visible = (mask[..., points].sum(-1) for mask in (self.gross, self.visible))
-        return (gross > _SUSPICIOUS_SHARE * visible).any(0).nonzero()[:, 0]
-
-
-def _pixels(measurements: Measurements, points: Tensor) -> Tensor:
-    """The keypoints (C, 2, F, k) of some points of one session, NaN where not seen."""
-    pixels, visible = (measurements.by_frame(given[0])[..., points] for given in (measurements.pixels, measurements.visible))
-    return pixels.double().where(visible[:, None], torch.nan)
-
-
 def _noise(squared: Tensor, visible: Tensor) -> Tensor:
-    """A cautious estimate of the noise (P,) of each point's keypoints, from the smallest quarter of their residuals."""
+    """A cautious estimate of the noise (P,) of each point's keypoints, from the smallest tenth of their residuals.
+
+    Each squared residual is first divided by the fraction that remains after its 3D point was fitted.
+    """
     frames = torch.linspace(0, squared.shape[1] - 1, min(squared.shape[1], _MEASURED_FRAMES)).round().long()
-    known = squared[:, frames].double().where(visible[:, frames], torch.nan).flatten(0, 1)
-    quartile = known.nanquantile(0.25, dim=0)
-    overall = known.nanquantile(0.25)
-    return (quartile.where(quartile.isfinite(), overall).maximum(overall / 4) / _QUARTILE_CHI2_2).sqrt()
+    squared, visible = squared[:, frames].double(), visible[:, frames]
+    views = visible.sum(0)
+    known = (squared * (2 * views / (2 * views - 3).clamp_min(1))).where(visible, torch.nan).flatten(0, 1)
+    overall, each = known.nanquantile(_SHARE), known.nanquantile(_SHARE, dim=0)
+    each = each.where(each.isfinite(), overall).clamp(overall / _LARGEST_RATIO**2, overall * _LARGEST_RATIO**2)
+    return (each / _QUANTILE_CHI2_2).sqrt().clamp_min(_LEAST_NOISE_PX)

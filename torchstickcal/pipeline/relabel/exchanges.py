@@ -98,5 +98,6 @@ def _cased(text: str, like: str) -> str:
 
 
 def _part_of(name: str) -> str | None:
-    """The part of the body that a point belongs to, by its name."""
-    return next((part for part, words in _PARTS.items() if any(word in name.lower() for word in words)), None)
+    """The part of the body that a point belongs to, by the words of its name."""
+    endings = [word.lower() for word in _WORDS.findall(name)]
+    return next((part for part, words in _PARTS.items() if any(word.endswith(words) for word in endings)), None)

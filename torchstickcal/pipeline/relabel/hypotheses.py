@@ -16,8 +16,8 @@ _MOST_LABELLINGS = 8
 _RARITY = 2.0
 """What an exchange in one camera and frame must bring, since it is rarer than none."""
 _MOST_KEYPOINTS = 4_000_000
-_MARGIN = 8.0
-"""Least evidence with which something is changed: a ratio of likelihoods of 3000."""
+_MARGIN = 6.0
+"""Least evidence with which something is changed: a ratio of likelihoods of 400."""
 _MOTION_WEIGHT = 1.5
 _MOTION_LENIENCE = 1.5
 
