@@ -13,6 +13,7 @@ from torchstickcal.model.state import State
 from torchstickcal.observations import Observations
 from torchstickcal.pipeline.relabel.exchanges import Exchange, exchanges
 from torchstickcal.pipeline.relabel.hypotheses import exchanged_where
+from torchstickcal.pipeline.relabel.persons import other_persons
 from torchstickcal.pipeline.relabel.views import RayViews
 
 __all__ = ["Exchange", "Labels", "exchanges", "mended"]
@@ -20,6 +21,11 @@ __all__ = ["Exchange", "Labels", "exchanges", "mended"]
 _GROSS_SIGMAS = 6.0
 _GROSS_SHARE = 0.2
 """Least residual of an exchanged keypoint, as a share of its distance to the one that it is exchanged for."""
+_CONTRADICTING_SHARE, _FAR_SHARE = 0.5, 0.05
+"""Share of a camera's keypoints that must contradict their points, and their least median residual as a share of the body's root
+mean square size, for another person to be thought of."""
+_LARGEST_OTHER_SHARE = 0.6
+"""Of a camera's frames: a camera that shows another person in more is none that agrees with the others."""
 _SUSPICIOUS_SHARE = 0.3
 """Share of the keypoints of an exchange that must contradict the points for a camera's frame to be looked at."""
 _MEASURED_FRAMES = 2000
@@ -122,12 +128,21 @@ def mended(
         if not len(frames):
             continue
         views = RayViews.of(measurements, state, sigma_px, frames).at(points)
-        where = exchanged_where(views, residuals.pixels[..., points], frames)
+        where = exchanged_where(views, residuals.pixels[..., points], frames, exchange.margin)
         if where.any():
             partner = torch.arange(measurements.points_per_frame, device=points.device)
             partner[points] = points.roll(len(exchange.pairs))
             labels, measurements, state = with_labels(labels.exchanged(where, partner), where.any(0))
             residuals = _Residuals.of(measurements, state)
+    frames = residuals.contradicting.any(0).nonzero()[:, 0]
+    if len(frames) and measurements.num_cameras > 2:
+        other = torch.zeros_like(residuals.contradicting)
+        other[:, frames] = other_persons(RayViews.of(measurements, state, sigma_px, frames))
+        other &= residuals.contradicting
+        seen = residuals.visible.any(-1)
+        other &= (other.sum(-1) <= _LARGEST_OTHER_SHARE * seen.sum(-1))[:, None]
+        if other.any():
+            labels, measurements, state = with_labels(replace(labels, other_person=other[None]), other.any(0))
     if all(map(torch.equal, (labels.index, labels.other_person), (given[0].index, given[0].other_person))):
         return given
     return labels, measurements, state
@@ -139,6 +154,8 @@ class _Residuals:
 
     squared: Tensor
     """(C, F, P), square pixels, 0 where not seen"""
+    visible: Tensor
+    """(C, F, P)"""
     pixels: Tensor
     """(C, 2, F, P), NaN where not seen"""
     sigma_px: Tensor
@@ -149,7 +166,18 @@ class _Residuals:
         squared = measurements.by_frame(measurements.squared_residuals(state)[0])
         visible = measurements.by_frame(measurements.visible[0])
         pixels = measurements.by_frame(measurements.pixels[0]).where(visible[:, None], torch.nan)
-        return _Residuals(squared.where(visible, 0.0), pixels, _noise(squared, visible))
+        return _Residuals(squared.where(visible, 0.0), visible, pixels, _noise(squared, visible))
+
+    @property
+    def contradicting(self) -> Tensor:
+        """(C, F), True where most keypoints of a camera contradict their points by much of the size of the body in the image."""
+        gross = self.squared > (_GROSS_SIGMAS * self.sigma_px).square()
+        many = gross.sum(-1) > _CONTRADICTING_SHARE * self.visible.sum(-1)
+        if not many.any():
+            return many
+        extent = (self.pixels - self.pixels.nanmean(-1, keepdim=True)).square().sum(1)
+        far = self.squared.where(self.visible, torch.nan).nanmedian(-1).values > _FAR_SHARE**2 * extent.nanmean(-1)
+        return many & far
 
     def suspicious(self, points: Tensor) -> Tensor:
         """The frames (F,) in which keypoints of one camera contradict their points as much as if they were exchanged.

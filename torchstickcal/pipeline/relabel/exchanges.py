@@ -14,6 +14,9 @@ _PARTS = {
     "face": ("eye", "ear", "mouth", "cheek", "temple"),
 }
 
+_MARGIN_OF_PARTS = 12.0
+"""Parts of the body are exchanged alone more rarely than all of it."""
+
 
 @dataclass(frozen=True)
 class Exchange:
@@ -22,10 +25,12 @@ class Exchange:
     Args:
         what: for messages, in the plural.
         pairs: of points; no point is in two of them.
+        margin: least evidence with which it is undone, the logarithm of a ratio of likelihoods.
     """
 
     what: str
     pairs: tuple[tuple[int, int], ...]
+    margin: float = 6.0
 
 
 def exchanges(point_names: Sequence[str] | None, sticks: Sequence[tuple[int, int]]) -> list[Exchange]:
@@ -54,7 +59,7 @@ def exchanges(point_names: Sequence[str] | None, sticks: Sequence[tuple[int, int
         for ends in map(sorted, sticks)
         if all(end in dict(body) for end in ends) and sorted(dict(body)[end] for end in ends) in map(sorted, sticks)
     }
-    found += [Exchange(what, pairs) for what, pairs in parts.items() if pairs and pairs != body]
+    found += [Exchange(what, pairs, _MARGIN_OF_PARTS) for what, pairs in parts.items() if pairs and pairs != body]
     for start, end in sticks:
         if not names or not (_part_of(names[start]) and _part_of(names[end])):  # a limb that stands in for a stick has none
             label = f" {names[start]} - {names[end]}" if names else f" of points {start} and {end}"

@@ -16,13 +16,11 @@ _MOST_LABELLINGS = 8
 _RARITY = 2.0
 """What an exchange in one camera and frame must bring, since it is rarer than none."""
 _MOST_KEYPOINTS = 4_000_000
-_MARGIN = 6.0
-"""Least evidence with which something is changed: a ratio of likelihoods of 400."""
 _MOTION_WEIGHT = 1.5
 _MOTION_LENIENCE = 1.5
 
 
-def exchanged_where(views: RayViews, pixels: Tensor, frames: Tensor) -> Tensor:
+def exchanged_where(views: RayViews, pixels: Tensor, frames: Tensor, margin: float) -> Tensor:
     """In which cameras and frames the points of some pairs are exchanged.
 
     For each frame the likeliest labellings of the cameras are collected: of those in which the rays meet best. Between them and
@@ -33,6 +31,7 @@ def exchanged_where(views: RayViews, pixels: Tensor, frames: Tensor) -> Tensor:
         views: the points of the pairs, those of the first sides first, in n frames in which something is suspicious.
         pixels: the same points in all F frames, (C, 2, F, 2 k), NaN where not seen.
         frames: the numbers of the n frames, (n,).
+        margin: least evidence of what is exchanged, the logarithm of a ratio of likelihoods.
 
     Returns:
         (C, F)
@@ -46,7 +45,7 @@ def exchanged_where(views: RayViews, pixels: Tensor, frames: Tensor) -> Tensor:
     labellings = torch.cat([labellings, ~labellings])
     motion = _motion_evidence(pixels, partner)
     chosen = _path(labellings, within.repeat(2, 1) - _RARITY * labellings.sum(1), motion)
-    return _with_margin(chosen, views, partner, frames, motion)
+    return _with_margin(chosen, views, partner, frames, motion, margin)
 
 
 def _labellings(views: RayViews, partner: Tensor) -> tuple[Tensor, Tensor]:
@@ -115,7 +114,9 @@ def _path(labellings: Tensor, within: Tensor, motion: Tensor) -> Tensor:
     return labellings.gather(0, chosen.expand(1, *labellings.shape[1:]))[0]
 
 
-def _with_margin(chosen: Tensor, views: RayViews, partner: Tensor, frames: Tensor, motion: Tensor) -> Tensor:
+def _with_margin(
+    chosen: Tensor, views: RayViews, partner: Tensor, frames: Tensor, motion: Tensor, margin: float
+) -> Tensor:
     """The exchanges (C, F) of which the evidence is clear.
 
     In a suspicious frame each camera's own exchange must be. In the other frames, of which the views agree as they are, all
@@ -124,15 +125,15 @@ def _with_margin(chosen: Tensor, views: RayViews, partner: Tensor, frames: Tenso
     signs = torch.where(chosen, -1.0, 1.0).to(motion)
     agreement = motion * signs[:, :-1] * signs[:, 1:]
     moving = torch.nn.functional.pad(agreement, (1, 0)) + torch.nn.functional.pad(agreement, (0, 1))
-    clear = chosen & (moving.sum(0) - _RARITY * len(chosen) > _MARGIN)
+    clear = chosen & (moving.sum(0) - _RARITY * len(chosen) > margin)
     labels = chosen[:, frames]
     own = torch.eye(len(labels), dtype=torch.bool, device=labels.device)[..., None]
     alternatives = torch.cat([labels[None], labels ^ own, torch.zeros_like(labels)[None]])
     evidence = torch.cat(
         [views.at_frames(part).exchanged(alternatives[..., part], partner).total_evidence() for part in _parts(views)], dim=-1
     )
-    whole = evidence[0] - evidence[-1] + moving[:, frames].sum(0) > _MARGIN
-    each = evidence[0] - evidence[1:-1] + moving[:, frames] > _MARGIN
+    whole = evidence[0] - evidence[-1] + moving[:, frames].sum(0) > margin
+    each = evidence[0] - evidence[1:-1] + moving[:, frames] > margin
     clear[:, frames] = labels & each & whole
     return clear
 
