@@ -182,7 +182,7 @@ def test_callback_hears_every_iteration_and_the_end(noisy):
     assert tuple(listener.records) == calibration.iterations
     assert listener.results == [calibration]
     assert [stage.name for stage in calibration.stages] == ["unscaled", "metric", "refined", "trajectories"]
-    assert calibration.seconds.keys() == {"initialise", "unscaled", "metric", "refined", "trajectories", "total"}
+    assert calibration.seconds.keys() == {*("initialise", "relabel", "unscaled", "metric", "refined", "trajectories", "total")}
 
 
 def test_a_stage_that_does_not_converge_is_a_status(noisy):

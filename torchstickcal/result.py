@@ -150,7 +150,7 @@ class Calibration:
     camera_names: tuple[str, ...]
     stages: tuple[StageRecord, ...]
     seconds: dict[str, float]
-    """time of the initialisation, of each stage and in total"""
+    """time of the initialisation, of the search for label errors, of each stage and in total"""
     warnings: tuple[str, ...]
     """what a careful user should know"""
 

@@ -323,7 +323,9 @@ def _relabelling(stages: Sequence[tuple[str, Stage]], begun: Adjustment, run: Ru
     for _ in range(_MAX_RELABELLINGS if run.config.relabel else 0):
         before = [ended[session] for session in range(ended.seen.sessions)]
         after = [_relabelled(session, run) for session in before]
-        changed = torch.tensor([new is not old for new, old in zip(after, before, strict=True)], device=ended.state.points.device)
+        changed = torch.tensor(
+            [new is not old for new, old in zip(after, before, strict=True)], device=ended.state.points.device
+        )
         if not changed.any():
             break
         ended = _through(stages, Adjustment.stack(after), run).replaced(~changed, ended)

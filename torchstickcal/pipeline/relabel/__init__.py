@@ -22,8 +22,8 @@ _GROSS_SIGMAS = 6.0
 _GROSS_SHARE = 0.2
 """Least residual of an exchanged keypoint, as a share of its distance to the one that it is exchanged for."""
 _CONTRADICTING_SHARE, _FAR_SHARE = 0.5, 0.05
-"""Share of a camera's keypoints that must contradict their points, and their least median residual as a share of the body's root
-mean square size, for another person to be thought of."""
+"""For another person to be thought of: share of a camera's keypoints that must contradict their points, and their least median
+residual as a share of the body's root mean square size."""
 _LARGEST_OTHER_SHARE = 0.6
 """Of a camera's frames: a camera that shows another person in more is none that agrees with the others."""
 _SUSPICIOUS_SHARE = 0.3
@@ -31,7 +31,8 @@ _SUSPICIOUS_SHARE = 0.3
 _MEASURED_FRAMES = 2000
 _LEAST_NOISE_PX = 0.05
 _SHARE, _QUANTILE_CHI2_2 = 0.1, 0.2107
-"""A share of keypoints that are right even where most labels are wrong, and the chi-square quantile of it, 2 degrees of freedom."""
+"""A share of keypoints that are right even where most labels are wrong, and the quantile of it of the chi-square distribution
+with 2 degrees of freedom."""
 _LARGEST_RATIO = 3.0
 """Of the noise of a point to that of all points."""
 
@@ -69,6 +70,16 @@ class Labels:
     def exchanged(self, where: Tensor, partner: Tensor) -> Labels:
         """After one more exchange: where (C, F) it is of one session, partner (P,) the point whose keypoint each point gets."""
         return replace(self, index=self.index.where(~where[..., None], self.index[..., partner]))
+
+    def without(self, other: Tensor) -> Labels:
+        """Of one session, with camera frames (C, F) set aside as those of another person."""
+        own = torch.arange(self.index.shape[-1], device=other.device)
+        return Labels(torch.where(other[..., None], own, self.index), other[None])
+
+    def exchanged_frames(self, exchange: Exchange) -> Tensor:
+        """(B, C, F), True where any pair of an exchange uses each other's keypoints."""
+        first, second = torch.tensor(exchange.pairs, device=self.index.device).mT
+        return ((self.index[..., first] == second) | (self.index[..., second] == first)).any(-1)
 
     @property
     def touched(self) -> Tensor:
@@ -142,7 +153,7 @@ def mended(
         seen = residuals.visible.any(-1)
         other &= (other.sum(-1) <= _LARGEST_OTHER_SHARE * seen.sum(-1))[:, None]
         if other.any():
-            labels, measurements, state = with_labels(replace(labels, other_person=other[None]), other.any(0))
+            labels, measurements, state = with_labels(labels.without(other), other.any(0))
     if all(map(torch.equal, (labels.index, labels.other_person), (given[0].index, given[0].other_person))):
         return given
     return labels, measurements, state
@@ -170,7 +181,7 @@ class _Residuals:
 
     @property
     def contradicting(self) -> Tensor:
-        """(C, F), True where most keypoints of a camera contradict their points by much of the size of the body in the image."""
+        """(C, F), True where most keypoints of a camera are far from their points, compared with the size of the body."""
         gross = self.squared > (_GROSS_SIGMAS * self.sigma_px).square()
         many = gross.sum(-1) > _CONTRADICTING_SHARE * self.visible.sum(-1)
         if not many.any():

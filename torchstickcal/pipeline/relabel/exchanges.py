@@ -31,6 +31,8 @@ class Exchange:
     what: str
     pairs: tuple[tuple[int, int], ...]
     margin: float = 6.0
+    whole: bool = True
+    """False for a part of another exchange"""
 
 
 def exchanges(point_names: Sequence[str] | None, sticks: Sequence[tuple[int, int]]) -> list[Exchange]:
@@ -52,14 +54,14 @@ def exchanges(point_names: Sequence[str] | None, sticks: Sequence[tuple[int, int
     names = point_names or ()
     body = mirrored_pairs(names)
     found = [Exchange("left and right of the body", body)] if body else []
-    parts = {
-        f"left and right of the {part}": tuple(pair for pair in body if _part_of(names[pair[0]]) == part) for part in _PARTS
-    } | {
-        "the left and the right stick": tuple((start, dict(body)[start]) for start in ends)
-        for ends in map(sorted, sticks)
-        if all(end in dict(body) for end in ends) and sorted(dict(body)[end] for end in ends) in map(sorted, sticks)
-    }
-    found += [Exchange(what, pairs, _MARGIN_OF_PARTS) for what, pairs in parts.items() if pairs and pairs != body]
+    parts = {f"left and right of the {part}": tuple(p for p in body if _part_of(names[p[0]]) == part) for part in _PARTS}
+    partner, held = dict(body), {frozenset(ends) for ends in sticks}
+    for ends in sticks:
+        if all(end in partner for end in ends) and frozenset(partner[end] for end in ends) in held:
+            parts[f"the sticks that {names[ends[0]]} and {names[partner[ends[0]]]} belong to"] = tuple(
+                (end, partner[end]) for end in ends
+            )
+    found += [Exchange(what, pairs, _MARGIN_OF_PARTS, whole=False) for what, pairs in parts.items() if pairs and pairs != body]
     for start, end in sticks:
         if not names or not (_part_of(names[start]) and _part_of(names[end])):  # a limb that stands in for a stick has none
             label = f" {names[start]} - {names[end]}" if names else f" of points {start} and {end}"

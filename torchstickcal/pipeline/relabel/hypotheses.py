@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+from dataclasses import replace
 
 import numpy as np
 import torch
@@ -114,13 +115,12 @@ def _path(labellings: Tensor, within: Tensor, motion: Tensor) -> Tensor:
     return labellings.gather(0, chosen.expand(1, *labellings.shape[1:]))[0]
 
 
-def _with_margin(
-    chosen: Tensor, views: RayViews, partner: Tensor, frames: Tensor, motion: Tensor, margin: float
-) -> Tensor:
+def _with_margin(chosen: Tensor, views: RayViews, partner: Tensor, frames: Tensor, motion: Tensor, margin: float) -> Tensor:
     """The exchanges (C, F) of which the evidence is clear.
 
-    In a suspicious frame each camera's own exchange must be. In the other frames, of which the views agree as they are, all
-    cameras are exchanged, and the motion of all must be against its being so in the frames before and after.
+    In a suspicious frame each camera's own exchange must be, and its keypoints must then agree with the others. In the other
+    frames, of which the views agree as they are, all cameras are exchanged, and the motion of all must be against its being so
+    in the frames before and after.
     """
     signs = torch.where(chosen, -1.0, 1.0).to(motion)
     agreement = motion * signs[:, :-1] * signs[:, 1:]
@@ -132,10 +132,21 @@ def _with_margin(
     evidence = torch.cat(
         [views.at_frames(part).exchanged(alternatives[..., part], partner).total_evidence() for part in _parts(views)], dim=-1
     )
+    contribution = torch.cat(
+        [_contributions(views.at_frames(part).exchanged(labels[:, part], partner)) for part in _parts(views)], dim=-1
+    )
     whole = evidence[0] - evidence[-1] + moving[:, frames].sum(0) > margin
     each = evidence[0] - evidence[1:-1] + moving[:, frames] > margin
-    clear[:, frames] = labels & each & whole
+    clear[:, frames] = labels & each & whole & (contribution > 0)
     return clear
+
+
+def _contributions(views: RayViews) -> Tensor:
+    """What the keypoints of each camera add to the evidence of all, (C, n)."""
+    others = ~torch.eye(len(views.weights), dtype=torch.bool, device=views.weights.device)[..., None, None]
+    cameras = (slice(None), slice(None), None)
+    rays, weights = views.rays[cameras].expand(-1, -1, len(others), -1, -1), views.weights[:, None] * others
+    return views.total_evidence() - replace(views, rays=rays, weights=weights).total_evidence()
 
 
 def _parts(views: RayViews) -> list[slice]:

@@ -30,9 +30,7 @@ def other_persons(views: RayViews) -> Tensor:
     count = seen.sum(-1)
     pairs = list(itertools.combinations(range(len(count)), 2))
     agreeing = torch.stack(
-        [
-            ((views.squared_distances(views.points(list(pair))) < _AGREEING_SIGMAS**2) & seen).sum(-1) for pair in pairs
-        ]
+        [((views.squared_distances(views.points(list(pair))) < _AGREEING_SIGMAS**2) & seen).sum(-1) for pair in pairs]
     )  # (pairs, C, n)
     total = agreeing.sum(1)
     best = total.argmax(0)
