@@ -91,6 +91,13 @@ def test_exchanges_of_left_and_right_are_undone(cameras: int, share: float):
     assert [camera["frames_relabelled"] for camera in summary(found)["cameras"]] == where.sum(1).tolist()
 
 
+@pytest.mark.parametrize("settings", [{"extends": "default", "precision": "float32"}, {"extends": "lbfgs"}])
+def test_exchanges_are_undone_in_every_precision_and_solver(settings: dict[str, str]):
+    observations, _ = session(3, 20)
+    where = chosen(observations, 0.2)
+    assert torch.equal(calibrate(relabelled(observations, where, body(observations)), settings).relabelled.any(-1), where)
+
+
 def test_exchanges_of_the_legs_alone_are_undone():
     observations, _ = session()
     legs = [pair for pair in body(observations) if "knee" in observations.point_label(pair[0])]

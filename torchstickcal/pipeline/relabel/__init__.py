@@ -176,7 +176,7 @@ class _Residuals:
     def of(measurements: Measurements, state: State) -> _Residuals:
         squared = measurements.by_frame(measurements.squared_residuals(state)[0])
         visible = measurements.by_frame(measurements.visible[0])
-        pixels = measurements.by_frame(measurements.pixels[0]).where(visible[:, None], torch.nan)
+        pixels = measurements.by_frame(measurements.pixels[0]).double().where(visible[:, None], torch.nan)
         return _Residuals(squared.where(visible, 0.0), visible, pixels, _noise(squared, visible))
 
     @property
