@@ -30,6 +30,7 @@ FLOORS = [
     ["pipeline.run", "pipeline.scale"],
     ["pipeline.stage"],
     ["pipeline.initialise", "pipeline.synchronise"],
+    ["pipeline.relabel"],
     ["pipeline.focal_search"],
     ["pipeline.adjust"],
     ["pipeline.check", "pipeline.warnings"],

@@ -120,6 +120,7 @@ class Config:
         precision: of the arrays that have an entry per keypoint. Unknowns and sums over keypoints are float64 in any case.
             ``float32`` halves the memory and suits graphics cards that are slow in float64.
         initialise: the first estimate.
+        relabel: whether label errors are undone: left and right of the body or the ends of a stick exchanged, another person.
         scale: a length between points that sets the scale instead of the sticks.
         refine: what else is estimated of the cameras, in every stage that estimates them; ``auto`` for what the keypoints
             contradict.
@@ -141,6 +142,7 @@ class Config:
     solver: Literal["gauss_newton", "lbfgs"] = "gauss_newton"
     precision: Literal["float64", "float32"] = "float64"
     initialise: InitialiseSettings = field(default_factory=InitialiseSettings)
+    relabel: bool = False
     scale: ScaleSettings | None = None
     refine: list[Refine] | Literal["auto"] = field(default_factory=list)
     camera_groups: list[str] = field(default_factory=list)

@@ -24,7 +24,7 @@ from torchstickcal.solvers.uncertainty import centre_covariances, point_covarian
 from torchstickcal.stick import Stick
 from torchstickcal.untrusted import open_arrays, reading
 
-_FORMAT = "torchstickcal calibration 5"
+_FORMAT = "torchstickcal calibration 6"
 _TENSORS = {
     "rotations": "C 3 3",
     "translations": "C 3",
@@ -36,6 +36,8 @@ _TENSORS = {
     "sigma_px": "P",
     "intrinsics": "C 3 3",
     "frame_index": "C F",
+    "keypoint_index": "C F P",
+    "other_person": "C F",
 }
 _OPTIONAL_TENSORS = {"distortion": "C D", "image_size": "C 2", "times": "G"}
 """The axes of the tensors of a calibration, as of :func:`torchstickcal.shapes.check_shapes`."""
@@ -131,6 +133,11 @@ class Calibration:
     ``radial``, ``time_offset``, ``readout``"""
     frame_index: Tensor
     """(C, F), the common frame (of G) nearest to each frame of a camera, -1 where the frame was left out"""
+    keypoint_index: Tensor
+    """(C, F, P), the point whose given keypoint each point uses: its own, except where label errors were undone. Residuals and
+    inliers are about the keypoints that points use."""
+    other_person: Tensor
+    """(C, F), True where all keypoints of a camera's frame were set aside: they fit together, but show another person"""
     times: Tensor | None
     """(G,), float64, seconds on the clock of the first camera at which the middle row of its image was exposed in each common
     frame; None without a frame rate"""
@@ -143,7 +150,7 @@ class Calibration:
     camera_names: tuple[str, ...]
     stages: tuple[StageRecord, ...]
     seconds: dict[str, float]
-    """time of the initialisation, of each stage and in total"""
+    """time of the initialisation, of the search for label errors, of each stage and in total"""
     warnings: tuple[str, ...]
     """what a careful user should know"""
 
@@ -157,6 +164,11 @@ class Calibration:
         """``converged``, or which stage did not and why."""
         failed = [f"{stage.name}: {stage.stop}" for stage in self.stages if not stage.stop.converged]
         return "; ".join(failed) or "converged"
+
+    @property
+    def relabelled(self) -> Tensor:
+        """(C, F, P), True where a point uses the keypoint that was given for another: a label error that was undone."""
+        return self.keypoint_index != torch.arange(self.keypoint_index.shape[2], device=self.keypoint_index.device)
 
     @property
     def iterations(self) -> tuple[IterationRecord, ...]:
@@ -325,7 +337,7 @@ class Calibration:
 def _tensor(arrays: Mapping[str, Any], name: str) -> Tensor:
     """An array of a file, of the kind of numbers that it has by its name."""
     tensor = torch.from_numpy(arrays[name])
-    kinds = "b" if name == "inliers" else "i" if name == "frame_index" else "iuf" if name == "image_size" else "f"
+    kinds = {"inliers": "b", "other_person": "b", "frame_index": "i", "keypoint_index": "i", "image_size": "iuf"}.get(name, "f")
     if arrays[name].dtype.kind not in kinds:
         raise TypeError(f"{name} is of the type {tensor.dtype}")
     return tensor

@@ -15,6 +15,7 @@ from torchstickcal.geometry.cameras import Intrinsics
 from torchstickcal.model.measurements import Measurements
 from torchstickcal.model.unknowns import RigUnknowns
 from torchstickcal.observations import Observations, coefficients_of
+from torchstickcal.pipeline.relabel import Labels
 from torchstickcal.stick import Stick, check_ends
 
 
@@ -94,6 +95,15 @@ class LayerInputs:
             cameras=self.cameras[chosen],
             lengths_m=self.lengths_m[chosen],
             image_size=None if self.image_size is None else self.image_size[chosen],
+        )
+
+    def relabelled(self, labels: Labels) -> LayerInputs:
+        """The keypoints where they belong by the labels of the sessions."""
+        confidence = self.confidence
+        return replace(
+            self,
+            keypoints=self.keypoints.gather(3, labels.index[..., None].expand(-1, -1, -1, -1, 2)),
+            confidence=None if confidence is None else confidence.gather(3, labels.index),
         )
 
     def observations(self, session: int) -> Observations:

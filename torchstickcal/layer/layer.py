@@ -19,6 +19,7 @@ from torchstickcal.model.state import State
 from torchstickcal.model.unknowns import RigUnknowns
 from torchstickcal.pipeline.adjust import Adjustment, adjust_cameras, adjust_points, begin
 from torchstickcal.pipeline.attach import attach_gradients
+from torchstickcal.pipeline.relabel import Labels
 from torchstickcal.pipeline.run import Run
 from torchstickcal.precision import full_precision
 from torchstickcal.solvers.gradients import GradientMode, gradient_mode
@@ -35,9 +36,9 @@ class CalibrationLayer(nn.Module):
     Where the configuration estimates lenses, those given are the start. Where it estimates clocks, frames of equal number are
     taken to be of about the same time: time offsets of up to about a frame are found, whole frames are not searched for.
 
-    Some things count as constants in the gradients: the noise of the keypoints and the choice of outliers, where the
-    configuration estimates them; and, with clocks, how far each keypoint is moved to the common time, its velocity in the
-    image, and its loss of weight by interpolation.
+    Some things count as constants in the gradients: the noise of the keypoints, the choice of outliers and the labels (which
+    keypoint each point uses), where the configuration estimates them; and, with clocks, how far each keypoint is moved to the
+    common time, its velocity in the image, and its loss of weight by interpolation.
 
     Args:
         sticks: the stick or sticks, as of :class:`Observations`.
@@ -151,10 +152,12 @@ class CalibrationLayer(nn.Module):
         """Sessions adjusted side by side, their last stages with gradients by what was given."""
         with torch.no_grad():
             ended = adjust_points(adjust_cameras(begun, run, only_last), run)
-        data = given.measurements(ended.seen, ended.measurements, self._refined, self.config.camera_groups)
+        data = given.relabelled(ended.labels).measurements(
+            ended.seen, ended.measurements, self._refined, self.config.camera_groups
+        )
         state = attach_gradients(ended, data, run, self.gradient)
         status = tuple(ended.status(session) for session in range(data.sessions))
-        return LayerResult.of(data, state, ended.last.inliers, ended.last.sigma_px, status, given.keypoints.dtype)
+        return LayerResult.of(data, state, ended.last.inliers, ended.last.sigma_px, ended.labels, status, given.keypoints.dtype)
 
     def _failed(self, given: LayerInputs, status: Sequence[str]) -> LayerResult:
         """Sessions that could not be calibrated, and why: poses of nothing, cameras as given, and gradients of zero."""
@@ -164,7 +167,7 @@ class CalibrationLayer(nn.Module):
             poses = torch.eye(3).to(data.pixels).expand(*shape, 3, 3), zeros(*shape, 3)
             state = State(*poses, zeros(len(status), 3, data.num_columns), data.unknowns.given)
             sigma_px = zeros(len(status), data.points_per_frame)
-            result = LayerResult.of(data, state, data.visible, sigma_px, status, given.keypoints.dtype)
+            result = LayerResult.of(data, state, data.visible, sigma_px, Labels.as_given(data), status, given.keypoints.dtype)
         no_gradient = given.no_gradient()
         return result.each(lambda tensor: tensor + no_gradient if tensor.is_floating_point() else tensor)
 

@@ -12,6 +12,7 @@ from torch import Tensor
 from torchstickcal.model.measurements import Measurements
 from torchstickcal.model.state import State
 from torchstickcal.pipeline.adjust import WarmStart
+from torchstickcal.pipeline.relabel import Labels
 
 
 @dataclass(frozen=True)
@@ -50,6 +51,10 @@ class LayerResult:
     """(B, F, P), True where two cameras or more see a point"""
     inliers: Tensor
     """(B, C, F, P), True where a keypoint was used"""
+    keypoint_index: Tensor
+    """(B, C, F, P), the point whose given keypoint each point uses: its own, except where label errors were undone"""
+    other_person: Tensor
+    """(B, C, F), True where all keypoints of a camera's frame were set aside: they show another person"""
     sigma_px: Tensor
     """(B, P), estimated noise of each point's keypoints, pixels"""
     converged: Tensor
@@ -59,7 +64,13 @@ class LayerResult:
 
     @staticmethod
     def of(
-        data: Measurements, state: State, inliers: Tensor, sigma_px: Tensor, status: Sequence[str], dtype: torch.dtype
+        data: Measurements,
+        state: State,
+        inliers: Tensor,
+        sigma_px: Tensor,
+        labels: Labels,
+        status: Sequence[str],
+        dtype: torch.dtype,
     ) -> LayerResult:
         """A result in a dtype.
 
@@ -68,6 +79,7 @@ class LayerResult:
             state: the estimate.
             inliers: (B, C, N), the keypoints that were used.
             sigma_px: (B, P).
+            labels: which given keypoint each point uses.
             status: of each session.
             dtype: of what floats.
         """
@@ -84,6 +96,8 @@ class LayerResult:
             points=data.by_frame(state.points).movedim(1, -1).where(known[..., None], 0.0).to(dtype),
             known=known,
             inliers=data.by_frame(inliers),
+            keypoint_index=labels.index,
+            other_person=labels.other_person,
             sigma_px=sigma_px.to(dtype),
             converged=torch.tensor([said == "converged" for said in status], device=known.device),
             status=tuple(status),

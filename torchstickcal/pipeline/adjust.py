@@ -20,6 +20,7 @@ from torchstickcal.model.unknowns import RigUnknowns, clock_refinements, with_re
 from torchstickcal.observations import Observations
 from torchstickcal.pipeline.focal_search import search_focal
 from torchstickcal.pipeline.initialise import initialise, triangulated
+from torchstickcal.pipeline.relabel import Labels, mended
 from torchstickcal.pipeline.run import Run
 from torchstickcal.pipeline.scale import check_scale, rulers
 from torchstickcal.pipeline.stage import StageResult, agreeing_cameras, run_stage
@@ -33,7 +34,8 @@ from torchstickcal.pipeline.synchronise import (
 )
 from torchstickcal.solvers import StageRecord
 
-_INITIALISE = "initialise"
+_INITIALISE, _RELABEL = "initialise", "relabel"
+_MAX_RELABELLINGS = 3
 
 
 @dataclass(frozen=True)
@@ -42,13 +44,16 @@ class Adjustment:
 
     observations: tuple[Observations, ...]
     frames: tuple[CommonFrames, ...]
+    """with the keypoints as given"""
     refined: tuple[str, ...]
     """what is estimated of the cameras beside their poses, of :data:`torchstickcal.model.unknowns.REFINEMENTS`"""
     seen: Measurements
-    """the keypoints as detected, on the common frames"""
+    """the keypoints as detected, on the common frames, where they belong by the labels"""
     measurements: Measurements
     """the same keypoints, moved in the image to where they would be at the times of the common frames"""
     state: State
+    labels: Labels
+    """which given keypoint each point uses, on the common frames"""
     results: tuple[StageResult, ...] = ()
     """of the last stage that estimated cameras, and of those after it"""
     records: tuple[tuple[StageRecord, ...], ...] = ((),)
@@ -66,13 +71,16 @@ class Adjustment:
             Measurements.stack([session.seen for session in sessions]),
             Measurements.stack([session.measurements for session in sessions]),
             State.stack([session.state for session in sessions]),
+            Labels.stack([session.labels for session in sessions]),
             records=((),) * len(sessions),
         )
 
     @property
     def exposures(self) -> Exposures:
         """When the keypoints were exposed."""
-        return Exposures.stack([Exposures.of(frames, self.window) for frames in self.frames])
+        sessions = enumerate(self.frames)
+        labelled = [replace(f, observations=self.labels[n : n + 1].applied(f.observations)) for n, f in sessions]
+        return Exposures.stack([Exposures.of(frames, self.window) for frames in labelled])
 
     @property
     def last_camera_stage(self) -> StageResult:
@@ -119,6 +127,31 @@ class Adjustment:
         """(C,), time offsets of one session's cameras beyond those by which their frames were chosen, as found, in frames."""
         found = self.seen.unknowns.by_name(self.state.unknowns).get("time_offset")
         return torch.zeros_like(self.frames[0].offsets_frames) if found is None else found[0, :, 0]
+
+    def __getitem__(self, session: int) -> Adjustment:
+        """One of the sessions that has just begun or ended a stage, without results."""
+        one = slice(session, session + 1)
+        return replace(
+            self,
+            observations=self.observations[one],
+            frames=self.frames[one],
+            seen=self.seen[one],
+            measurements=self.measurements[one],
+            state=self.state[one],
+            labels=self.labels[one],
+            results=(),
+            records=((),),
+        )
+
+    def replaced(self, where: Tensor, other: Adjustment) -> Adjustment:
+        """The adjustment with the results of some sessions (B,), True where, taken from another of the same sessions."""
+        taken = where.tolist()
+        return replace(
+            self,
+            state=self.state.replaced(where, other.state),
+            results=tuple(mine.replaced(where, theirs) for mine, theirs in zip(self.results, other.results, strict=True)),
+            records=tuple(b if t else a for a, b, t in zip(self.records, other.records, taken, strict=True)),
+        )
 
     def ended(self, result: StageResult) -> Adjustment:
         """After one more stage."""
@@ -203,13 +236,15 @@ def begin(
     seen = replace(seen, unknowns=RigUnknowns.of(refined, seen.cameras, config.camera_groups))
     if start is None:
         state = replace(state, unknowns=seen.unknowns.given)
-    begun = Adjustment((observations,), (frames,), tuple(refined), seen, seen, state)
+    begun = Adjustment((observations,), (frames,), tuple(refined), seen, seen, state, Labels.as_given(seen))
     if seen.unknowns.clocked:
         begun = replace(begun, measurements=begun.exposures.unmoved(seen))
-        if start is not None:
-            known = begun.measurements.keeping(start.inliers.flatten(1)[None])
-            support = Support.of(known, state, start.sigma_px[None].double())
-            begun = replace(begun, measurements=begun.exposures.at_common_times(seen, state, support))
+    if start is not None and config.relabel:
+        begun = _relabelled(begun, run)
+    if start is not None and seen.unknowns.clocked:
+        known = begun.measurements.keeping(start.inliers.flatten(1)[None])
+        support = Support.of(known, begun.state, start.sigma_px[None].double())
+        begun = replace(begun, measurements=begun.exposures.at_common_times(begun.seen, begun.state, support))
     run.took(_INITIALISE, time.perf_counter() - began)
     return begun
 
@@ -223,7 +258,10 @@ def adjust_cameras(adjustment: Adjustment, run: Run, only_last: bool = False) ->
         only_last: whether the state is near enough to begin with the last of these stages.
     """
     stages = list(run.camera_stages.items())
-    return _synchronised(_through(stages[-1:] if only_last else stages, adjustment, run), run)
+    if only_last:
+        return _synchronised(_through(stages[-1:], adjustment, run), run)
+    first = _relabelling(stages[:1], adjustment, run)
+    return _synchronised(_through(stages[1:], first, run), run)
 
 
 def adjust_again(adjustment: Adjustment, run: Run, refined: Sequence[str]) -> Adjustment:
@@ -248,7 +286,8 @@ def adjust_again(adjustment: Adjustment, run: Run, refined: Sequence[str]) -> Ad
     if set(refined) - set(adjustment.refined) <= clock_refinements():
         result = again.last._replace(state=state, minimum=replace(again.last.minimum, unknowns=values))
         return _synchronised(replace(again, results=(result,)), run)
-    return adjust_cameras(replace(again, results=(), records=((),) * seen.sessions), run)
+    begun = replace(again, results=(), records=((),) * seen.sessions)
+    return _synchronised(_through(run.camera_stages.items(), begun, run), run)
 
 
 def adjust_points(adjustment: Adjustment, run: Run) -> Adjustment:
@@ -276,6 +315,41 @@ def _through(stages: Iterable[tuple[str, Stage]], adjustment: Adjustment, run: R
     for name, stage in stages:
         adjustment = adjustment.ended(run_stage(name, stage, adjustment.measurements, adjustment.state, run))
     return adjustment
+
+
+def _relabelling(stages: Sequence[tuple[str, Stage]], begun: Adjustment, run: Run) -> Adjustment:
+    """Sessions after their first stages, which are run again where label errors were found, until none are left."""
+    ended = _through(stages, begun, run)
+    for _ in range(_MAX_RELABELLINGS if run.config.relabel else 0):
+        before = [ended[session] for session in range(ended.seen.sessions)]
+        after = [_relabelled(session, run) for session in before]
+        changed = torch.tensor(
+            [new is not old for new, old in zip(after, before, strict=True)], device=ended.state.points.device
+        )
+        if not changed.any():
+            break
+        ended = _through(stages, Adjustment.stack(after), run).replaced(~changed, ended)
+    return ended
+
+
+def _relabelled(adjustment: Adjustment, run: Run) -> Adjustment:
+    """One session with its label errors undone; the same object where there are none."""
+    began = time.perf_counter()
+    frames, given = adjustment.frames[0], adjustment.measurements
+
+    def seen_with(labels: Labels) -> Measurements:
+        fresh = measured(replace(frames, observations=labels.applied(frames.observations)), run.config)
+        return replace(adjustment.seen, pixels=fresh.pixels, confidence=fresh.confidence)
+
+    def measured_with(labels: Labels) -> Measurements:
+        again = replace(adjustment, labels=labels)
+        return again.exposures.unmoved(seen_with(labels)) if given.unknowns.clocked else seen_with(labels)
+
+    labels, measurements, state = mended(adjustment.labels, given, adjustment.state, measured_with)
+    run.took(_RELABEL, time.perf_counter() - began)
+    if labels is adjustment.labels:
+        return adjustment
+    return replace(adjustment, seen=seen_with(labels), measurements=measurements, state=state, labels=labels)
 
 
 def _synchronised(adjustment: Adjustment, run: Run) -> Adjustment:

@@ -56,6 +56,8 @@ def conclude(
         refined=ended.refined,
         unknowns={name: parameter.to(observations.keypoints.dtype) for name, parameter in unknowns.items()},
         frame_index=frames.index,
+        keypoint_index=_keypoint_index(ended),
+        other_person=frames.to_own(ended.labels.other_person[0], False),
         times=_times(frames, unknowns["readout"].value[0]),
         image_size=None if size is None else size.expand(count, 2).round().long().contiguous(),
         fisheye=observations.fisheye,
@@ -67,6 +69,12 @@ def conclude(
         seconds=dict(seconds),
         warnings=warnings_of(ended, unknowns, clocks, unsynchronised),
     )
+
+
+def _keypoint_index(ended: Adjustment) -> Tensor:
+    """The point whose given keypoint each point uses (C, F, P), in the cameras' own frames."""
+    own, index = ended.frames[0].to_own(ended.labels.index[0], -1), torch.arange(ended.observations[0].num_points)
+    return torch.where(own < 0, index.to(own.device), own)
 
 
 def _residuals(ended: Adjustment) -> Tensor:

@@ -12,6 +12,7 @@ from torchstickcal.model.objective import Objective
 from torchstickcal.model.unknowns import CameraUnknown, all_unknowns
 from torchstickcal.observations import Observations
 from torchstickcal.pipeline.adjust import Adjustment
+from torchstickcal.pipeline.relabel import exchanges
 from torchstickcal.pipeline.synchronise import ClockEstimate
 from torchstickcal.result import CameraParameter
 from torchstickcal.solvers.elimination.normal_equations import NormalEquations
@@ -36,7 +37,7 @@ def warnings_of(
         clocks: what a search for time offsets has found; None without one.
         unsynchronised: whether the motion contradicts the clocks, which were not estimated.
     """
-    found = [*ended.observations[0].warnings, *_keypoints(ended), *_same_views(ended)]
+    found = [*ended.observations[0].warnings, *_labels(ended), *_keypoints(ended), *_same_views(ended)]
     if len(ended.measurements.sticks) > 1:
         found += _contradicted_lengths(ended)
     for name, unknown in all_unknowns().items():
@@ -53,13 +54,35 @@ def warnings_of(
     return tuple(found)
 
 
+def _labels(ended: Adjustment) -> list[str]:
+    """Label errors that were undone, and frames that show another person."""
+    observations, labels = ended.observations[0], ended.labels
+    found: list[str] = []
+    for exchange in exchanges(observations.point_names, [stick.ends for stick in observations.sticks]):
+        if exchange.whole:
+            for camera, count in enumerate(labels.exchanged_frames(exchange)[0].sum(-1).tolist()):
+                if count:
+                    found.append(
+                        f"{observations.camera_label(camera)}: {exchange.what} were exchanged in {count} of "
+                        f"{observations.num_frames} frames, and corrected."
+                    )
+    for camera, count in enumerate(labels.other_person[0].sum(-1).tolist()):
+        if count:
+            found.append(
+                f"{observations.camera_label(camera)}: {count} of {observations.num_frames} frames were not used: all their "
+                "keypoints contradict the other cameras, as if they showed another person."
+            )
+    return found
+
+
 def _keypoints(ended: Adjustment) -> list[str]:
     """Keypoints that took no part, and points that are too noisy."""
     observations, measurements = ended.observations[0], ended.measurements
     found: list[str] = []
     comparable, kept = int(measurements.visible.sum()), int(ended.last.inliers.sum())
     takes_part = measurements.by_frame(measurements.active[0]).any(0)
-    seen = int(observations.visible[:, :, takes_part].sum())
+    same_person = ~ended.frames[0].to_own(ended.labels.other_person[0], False)
+    seen = int((observations.visible[:, :, takes_part] & same_person[..., None]).sum())
     if seen > comparable:
         found.append(f"{seen - comparable} of {seen} keypoints were not used: no second camera saw the point in that frame.")
     if comparable > kept:

@@ -74,8 +74,10 @@ def summary(calibration: Calibration) -> dict[str, Any]:
                 "rotation_std_deg": std_deg,
                 "reprojection_median_px": median_px if math.isfinite(median_px) else None,
                 "keypoints": keypoints,
+                "frames_relabelled": relabelled,
+                "frames_of_another_person": other,
             }
-            for name, centre, rotation, translation, std_m, std_deg, median_px, keypoints in zip(
+            for name, centre, rotation, translation, std_m, std_deg, median_px, keypoints, relabelled, other in zip(
                 calibration.camera_names,
                 calibration.camera_centres.tolist(),
                 calibration.rotations.tolist(),
@@ -84,6 +86,8 @@ def summary(calibration: Calibration) -> dict[str, Any]:
                 calibration.camera_std_deg.tolist(),
                 calibration.reprojection_median_px.tolist(),
                 _keypoints_used(calibration),
+                calibration.relabelled.any(-1).sum(-1).tolist(),
+                calibration.other_person.sum(-1).tolist(),
                 strict=True,
             )
         ],

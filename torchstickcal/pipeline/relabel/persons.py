@@ -1,0 +1,42 @@
+"""Frames in which a camera shows somebody else: all its keypoints contradict those of cameras that agree with one another."""
+
+from __future__ import annotations
+
+import itertools
+
+import torch
+from torch import Tensor
+
+from torchstickcal.pipeline.relabel.views import RayViews
+
+_AGREEING_SIGMAS = 3.0
+"""In deviations of a :class:`RayViews`."""
+_ATHLETE_SHARE, _OTHER_SHARE = 0.5, 0.25
+"""Share of the keypoints that agree with the points of others, from which on a camera shows the same person, or another."""
+_CLEAR_RATIO = 0.8
+_MIN_KEYPOINTS = 4
+
+
+def other_persons(views: RayViews) -> Tensor:
+    """The cameras (C, n) that show another person than those that agree with one another, in each frame.
+
+    Each pair of cameras proposes the points in which their rays meet, and the pair whose points most keypoints agree with is
+    believed. Where a pair with a camera that disagrees is about as good, nothing is said.
+
+    Args:
+        views: all points in n frames in which some camera contradicts the others as a whole.
+    """
+    seen = views.weights > 0
+    count = seen.sum(-1)
+    pairs = list(itertools.combinations(range(len(count)), 2))
+    agreeing = torch.stack(
+        [((views.squared_distances(views.points(list(pair))) < _AGREEING_SIGMAS**2) & seen).sum(-1) for pair in pairs]
+    )  # (pairs, C, n)
+    total = agreeing.sum(1)
+    best = total.argmax(0)
+    share = agreeing.gather(0, best.expand(1, *count.shape))[0] / count.clamp_min(1)
+    athlete = (share >= _ATHLETE_SHARE) & (count >= _MIN_KEYPOINTS)
+    other = (share <= _OTHER_SHARE) & (count >= _MIN_KEYPOINTS) & (athlete.sum(0) >= 2)
+    with_camera = torch.tensor([[camera in pair for pair in pairs] for camera in range(len(count))], device=total.device)
+    rival = torch.where(with_camera[..., None], total, 0).amax(1)  # (C, n)
+    return other & (rival < _CLEAR_RATIO * total.amax(0))
