@@ -10,7 +10,7 @@ from torchstickcal.losses.track import combined, consecutive
 from torchstickcal.model.measurements import Measurements
 from torchstickcal.model.state import State
 
-_CUT = 2.5
+_CUT = 3.5
 """Residual, in standard deviations, beyond which a keypoint takes no part in the estimate of the noise. With a wide cut,
 outliers raise the estimate, it lets more of them in, and stays at several times the noise."""
 _ITERATIONS = 4
