@@ -54,6 +54,10 @@ class Objective:
         """The objective of some of the sessions."""
         return Objective(self.measurements[sessions], {name: loss.of(sessions) for name, loss in self.losses.items()})
 
+    def information_of(self, name: str) -> Tensor:
+        """1 / sigma^2 of a camera-point loss at every column, (1 | B, 1, N)."""
+        return self._information[name]
+
     @property
     def track_losses(self) -> dict[str, TrackLoss]:
         """The losses that couple consecutive frames."""

@@ -7,6 +7,7 @@ from collections.abc import Mapping
 import torch
 from torch import Tensor
 
+from torchstickcal.model.correlation import error_correlation
 from torchstickcal.model.unknowns import RigEstimate, all_unknowns
 from torchstickcal.pipeline.adjust import Adjustment
 from torchstickcal.pipeline.check import CameraCheck
@@ -89,7 +90,8 @@ def _covariance(ended: Adjustment) -> Tensor:
         size = 6 * (measurements.num_cameras - 1) + measurements.unknowns.count
         return torch.full((size, size), torch.nan, dtype=torch.float64, device=measurements.pixels.device)
     kept = measurements.keeping(last.inliers & ended.agreeing_cameras[..., None])
-    return camera_covariance(likelihood(kept, last.losses, ended.last.sigma_px), last.state)[0]
+    correlation = error_correlation(kept, last.state, ended.last.sigma_px)
+    return camera_covariance(likelihood(kept, last.losses, ended.last.sigma_px), last.state, correlation)[0]
 
 
 def _unknowns(ended: Adjustment, check: CameraCheck, covariance: Tensor) -> dict[str, CameraParameter]:
