@@ -15,6 +15,7 @@ from torch import Tensor
 from torch.nn.functional import pad
 
 from torchstickcal.model.measurements import Measurements
+from torchstickcal.model.shrinkage import shrunk_logarithms
 from torchstickcal.model.state import State
 
 _CUT = 3.0
@@ -28,6 +29,9 @@ _LEAST_PAIRS = 30
 """Pairs of residuals from which on a bin is estimated by itself. Beyond, the correlation is taken to stay as it is."""
 _LEAST_VARIANCE = 0.05
 """Squared residual, in units of the noise, below which residuals are rounding errors."""
+_LARGEST_AMPLITUDE = 10.0
+_MEAN_BY_CHANCE = 0.8
+"""Mean of a positive quantity of which zero was found, in standard deviations of the estimate."""
 _VALUES_AT_ONCE = 2**22
 
 
@@ -72,7 +76,7 @@ class ErrorCorrelation:
         return self.values[..., lags] @ pairs / pairs.sum()
 
 
-def error_correlation(measurements: Measurements, state: State, sigma_px: Tensor) -> ErrorCorrelation:
+def error_correlation(measurements: Measurements, state: State, sigma_px: Tensor, contrast: float = 0.0) -> ErrorCorrelation:
     """The autocorrelation of the keypoint errors, from the residuals.
 
     The estimates of different points are shrunk towards their common mean (empirical Bayes), as those of the noise are.
@@ -81,6 +85,8 @@ def error_correlation(measurements: Measurements, state: State, sigma_px: Tensor
         measurements: the inliers.
         state: the solution.
         sigma_px: noise of each point's keypoints, (B, P), pixels.
+        contrast: variance of the logarithm of what lasts between points that is taken for granted; with more, points are drawn
+            less towards the mean.
     """
     m = measurements
     values = torch.zeros(m.sessions, m.points_per_frame, m.frames, dtype=torch.float64, device=m.pixels.device)
@@ -88,7 +94,13 @@ def error_correlation(measurements: Measurements, state: State, sigma_px: Tensor
     if m.frames > 2:
         bins = _bins(m.frames, values.device)
         products, pairs = _binned_products(m, _residual_tracks(m, state, sigma_px), bins)
-        values[..., 1:] = _kept(products, pairs, _freedom_share(m), bins.bincount())[..., bins]
+        free = _freedom_share(m)
+        products, pairs = free[..., None] * products, free[..., None] * pairs
+        common, time = _pooled(products.sum(1), pairs.sum(1), bins.bincount())
+        if bool(common.any()):
+            independent = 2 * free * m.by_frame(m.visible.sum(1)).sum(1) / time.clamp_max(m.frames)
+            amplitudes = _amplitudes(products, pairs, common, independent, contrast)
+            values[..., 1:] = (amplitudes[..., None] * common[:, None]).clamp(0.0, 1.0)[..., bins]
     return ErrorCorrelation(values)
 
 
@@ -140,36 +152,51 @@ def _freedom_share(m: Measurements) -> Tensor:
     return free / m.by_frame(2 * views).sum(1).clamp_min(1)
 
 
-def _kept(products: Tensor, pairs: Tensor, free: Tensor, widths: Tensor) -> Tensor:
-    """The correlation by bin, (B, P, bins), that chance does not explain.
+def _pooled(products: Tensor, pairs: Tensor, widths: Tensor) -> tuple[Tensor, Tensor]:
+    """The correlation of all points together by bin that chance does not explain, (B, bins), and its integrated time (B, 1).
 
     The sampling variance of a bin is one over its pairs where errors are independent. Where they last, the products at
     neighbouring lags are alike too (Bartlett's formula), by what was found at smaller lags.
 
     Args:
-        products: sums of the products of residuals, (B, P, bins).
-        pairs: their numbers, (B, P, bins).
-        free: (B, P), share of them that counts.
+        products: sums of the products of residuals, (B, bins).
+        pairs: their numbers, as far as they are independent, (B, bins).
         widths: (bins,), numbers of lags.
     """
     values = torch.zeros_like(products)
-    time, squares = (torch.ones_like(free[:, :1]) for _ in range(2))
+    time, squares = (torch.ones_like(products[:, :1]) for _ in range(2))
     for number, width in enumerate(widths.tolist()):
-        count, own = pairs[..., number], values[..., number]
-        if float(count.sum(1).max()) < _LEAST_PAIRS and number:
-            own.copy_(values[..., number - 1])
-            continue
-        inflation = torch.minimum(time.square(), width * squares)
-        variance = inflation / (free * count).clamp_min(0.1)
-        weights = (count > 0) / variance
-        estimates = products[..., number] / count.clamp_min(1)
-        total = weights.sum(1, keepdim=True).clamp_min(1e-300)
-        mean = (estimates * weights).sum(1, keepdim=True) / total
-        between = (((estimates - mean).square() - variance) * weights).sum(1, keepdim=True).div(total).clamp_min(0.0)
-        shrunk = mean + (estimates - mean) * between / (between + variance)
-        uncertain = (between * variance / (between + variance)).sqrt()
-        real = (mean > _SIGNIFICANT * total.rsqrt()) & (shrunk > _SIGNIFICANT_OF_POINT * uncertain)
-        own.copy_(shrunk.where(real, 0.0).clamp(0.0, 1.0))
-        pooled = (own * weights).sum(1, keepdim=True) / total
-        time, squares = time + 2 * width * pooled, squares + 2 * width * pooled.square()
-    return values
+        one = slice(number, number + 1)
+        variance = torch.minimum(time.square(), width * squares) / pairs[:, one].clamp_min(0.1)
+        found = products[:, one] / pairs[:, one].clamp_min(0.1)
+        found = found.where(found > _SIGNIFICANT * variance.sqrt(), 0.0).clamp(0.0, 1.0)
+        if number:
+            found = found.where(pairs[:, one] >= _LEAST_PAIRS, values[:, number - 1 : number])
+        values[:, one] = found
+        time, squares = time + 2 * width * found, squares + 2 * width * found.square()
+    return values, time
+
+
+def _amplitudes(products: Tensor, pairs: Tensor, common: Tensor, independent: Tensor, contrast: float) -> Tensor:
+    """How much of the common correlation (B, bins) each point has, (B, P), drawn towards that of all points.
+
+    It is a variance, that of the errors that last, estimated from few independent ones. So its logarithm is drawn towards the
+    mean, as that of the noise is. A point that has none where others clearly have some gets
+    what can have been missed by chance.
+
+    Args:
+        products: sums of the products of residuals, (B, P, bins).
+        pairs: their numbers, as far as they are independent, (B, P, bins).
+        common: the correlation of all points together.
+        independent: (B, P), number of independent errors that each point has had.
+        contrast: variance of the logarithms between points that is taken for granted.
+    """
+    by_chance = (pairs @ common.square()[..., None])[..., 0].clamp_min(1e-12).reciprocal()
+    own = (products @ common[..., None])[..., 0] * by_chance
+    least = _SIGNIFICANT_OF_POINT * by_chance.sqrt()
+    scatter = 2 / independent.clamp_min(0.1)
+    nothing = (own < least) & (least < (-_SIGNIFICANT_OF_POINT * scatter.sqrt()).exp())
+    own = torch.maximum(own, least).clamp_max(_LARGEST_AMPLITUDE)
+    sampling = by_chance / own.square() + scatter
+    drawn = shrunk_logarithms(own.log(), sampling, independent > 0, contrast).exp()
+    return drawn.where(~nothing, _MEAN_BY_CHANCE * by_chance.sqrt())

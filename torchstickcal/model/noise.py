@@ -10,6 +10,7 @@ from torch import Tensor
 from torchstickcal.losses import SmoothnessLoss
 from torchstickcal.losses.track import combined, consecutive
 from torchstickcal.model.measurements import Measurements
+from torchstickcal.model.shrinkage import shrunk_logarithms
 from torchstickcal.model.state import State
 
 _CUT = 4.0
@@ -118,19 +119,6 @@ def _truncated_moment(cut: float) -> float:
 
 
 def _shrink(variance: Tensor, degrees_of_freedom: Tensor) -> Tensor:
-    """Variances (B, P), their logarithms shrunk towards the mean of their session.
-
-    The sampling variance of a log variance is ``2 / degrees_of_freedom``. The variance between points is what the observed
-    variance of the log variances has beyond that.
-    """
+    """Variances (B, P), their logarithms, of sampling variance ``2 / degrees_of_freedom``, shrunk towards their mean."""
     sampling = 2 / degrees_of_freedom.clamp_min(0.1)
-    logs = variance.log()
-    weights = sampling.reciprocal() * (degrees_of_freedom > 0)
-    mean = _weighted_mean(logs, weights)
-    between = _weighted_mean((logs - mean).square() - sampling, weights).clamp_min(0.0)
-    mean = _weighted_mean(logs, 1 / (between + sampling))
-    return (mean + (logs - mean) * between / (between + sampling)).exp()
-
-
-def _weighted_mean(values: Tensor, weights: Tensor) -> Tensor:
-    return (values * weights).sum(1, keepdim=True) / weights.sum(1, keepdim=True).clamp_min(1e-300)
+    return shrunk_logarithms(variance.log(), sampling, degrees_of_freedom > 0).exp()

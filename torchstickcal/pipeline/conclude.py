@@ -90,8 +90,9 @@ def _covariance(ended: Adjustment) -> Tensor:
         size = 6 * (measurements.num_cameras - 1) + measurements.unknowns.count
         return torch.full((size, size), torch.nan, dtype=torch.float64, device=measurements.pixels.device)
     kept = measurements.keeping(last.inliers & ended.agreeing_cameras[..., None])
-    correlation = error_correlation(kept, last.state, ended.last.sigma_px)
-    return camera_covariance(likelihood(kept, last.losses, ended.last.sigma_px), last.state, correlation)[0]
+    sigma_px, times = ended.last.sigma_px, last.correlation_frames
+    correlation = error_correlation(kept, last.state, sigma_px)
+    return camera_covariance(likelihood(kept, last.losses, sigma_px * times.sqrt()), last.state, correlation, times)[0]
 
 
 def _unknowns(ended: Adjustment, check: CameraCheck, covariance: Tensor) -> dict[str, CameraParameter]:

@@ -23,7 +23,6 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from torchstickcal.geometry import se3
 from torchstickcal.geometry.cameras import inverse_depths
 from torchstickcal.losses import ReprojectionLoss
 from torchstickcal.model.correlation import ErrorCorrelation
@@ -36,8 +35,8 @@ _RESPONSE_VALUES = 2**23
 """Numbers of a segment's response to the cameras that are held at a time."""
 _LEAST_SEGMENT = 512
 _SPECTRUM_VALUES = 2**23
-_MOST_TAKEN_UP = 0.5
-"""Share of the lasting errors that the cameras can have taken up at most, in the correction for it."""
+_MOST_TAKEN_UP = 0.8
+"""Share of a point's lasting errors that the cameras can have taken up at most, in the correction for it."""
 
 
 def inflation(objective: Objective, state: State, root: Tensor, correlation: ErrorCorrelation, times: Tensor) -> Tensor:
@@ -50,42 +49,42 @@ def inflation(objective: Objective, state: State, root: Tensor, correlation: Err
         correlation: of the keypoint errors.
         times: (B, P), as many keypoints count as one.
     """
-    m, worth = objective.measurements, 1 / times
-    excess, squares, sums = torch.zeros_like(root), torch.zeros_like(times), list[Tensor]()
+    m = objective.measurements
     segments = _segments(m, root.shape[-1])
+    white, lasting = (root.new_zeros(m.sessions, m.points_per_frame, *root.shape[1:]) for _ in range(2))
+    sums: list[Tensor] = []
     for frames in segments:
-        added, own_squares, totals = _within_segment(*_cut(objective, state, frames), root, correlation, worth)
-        excess, squares = excess + added, squares + own_squares
-        sums.append(totals)
+        parts = _within_segment(*_cut(objective, state, frames), root, correlation)
+        white, lasting = white + parts[0], lasting + parts[1]
+        sums.append(parts[2])
     for step in range(1, len(segments)):
         for first, second in zip(range(len(segments)), range(step, len(segments)), strict=False):
-            weight = worth * correlation.between(segments[first], segments[second])
-            product = torch.einsum("bpdt,bp,bpet->bde", sums[first], weight, sums[second])
-            excess = excess + product + product.mT
-    lasting = excess.diagonal(dim1=1, dim2=2).sum(1) + ((1 - worth) * squares).sum(1)
-    found = torch.eye(root.shape[-1]).to(root) + excess
-    return found * _correction(found, lasting, m, correlation, worth)[:, None, None]
+            weight = correlation.between(segments[first], segments[second])[..., None, None]
+            product = sums[first] @ sums[second].mT * weight
+            lasting = lasting + product + product.mT
+    worth, hidden, noise = 1 / times, *_hidden(lasting, m, correlation, 1 / times)
+    by_point = (worth - 1)[..., None, None] * white + (worth * hidden)[..., None, None] * lasting
+    return noise[:, None, None] * (torch.eye(root.shape[-1]).to(root) + by_point.sum(1))
 
 
-def _correction(found: Tensor, lasting: Tensor, m: Measurements, correlation: ErrorCorrelation, worth: Tensor) -> Tensor:
-    """Factor (B,) on E for what the residuals do not show.
+def _hidden(lasting: Tensor, m: Measurements, correlation: ErrorCorrelation, worth: Tensor) -> tuple[Tensor, Tensor]:
+    """Factors on what lasts of each point's errors, (B, P), and on the noise, (B,), for what the residuals do not show.
 
     They show less of the errors that last than there is, because the cameras have taken up a part of them. So the correlation
     is underestimated, and the noise too.
 
     Args:
-        found: E by the residuals.
-        lasting: (B,), the part of E's trace that comes from the correlation.
+        lasting: each point's ``sum Q^T A (T - I) A^T Q``, (B, P, D, D), by the residuals.
         m: the inliers.
         correlation: by the residuals.
         worth: (B, P), weight of each point's keypoints.
     """
-    free = worth * m.by_frame((2 * m.visible.sum(1) - 3).clamp_min(0)).sum(1)
-    shown = (free * (correlation.times - 1)).sum(1) / m.frames
-    taken_up = (lasting / shown.clamp_min(1e-300)).clamp(0.0, _MOST_TAKEN_UP)
-    share = (lasting / found.diagonal(dim1=1, dim2=2).sum(1)).clamp(0.0, 1.0)
-    noise = 1 + lasting.clamp_min(0.0) / free.sum(1).clamp_min(1e-300)
-    return noise * (1 + share * taken_up / (1 - taken_up))
+    free = m.by_frame((2 * m.visible.sum(1) - 3).clamp_min(0)).sum(1).to(lasting)
+    taken_up = lasting.diagonal(dim1=2, dim2=3).sum(2)
+    shown = free * (correlation.times - 1) / m.frames
+    share = (taken_up / shown.clamp_min(1e-300)).clamp(0.0, _MOST_TAKEN_UP)
+    noise = 1 + (worth * taken_up).sum(1).clamp_min(0.0) / (worth * free).sum(1).clamp_min(1e-300)
+    return 1 / (1 - share), noise
 
 
 def _segments(m: Measurements, size: int) -> list[slice]:
@@ -106,27 +105,30 @@ def _cut(objective: Objective, state: State, frames: slice) -> tuple[Objective, 
 
 
 def _within_segment(
-    objective: Objective, state: State, root: Tensor, correlation: ErrorCorrelation, worth: Tensor
+    objective: Objective, state: State, root: Tensor, correlation: ErrorCorrelation
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """E - I of one segment, squares of each point's derivatives (B, P), and their sums over frames, (B, P, D, tracks)."""
+    """Each point's sums over one segment: ``Q^T A A^T Q`` and ``Q^T A (T - I) A^T Q``, (B, P, D, D), and of ``Q^T A``.
+
+    The last ones are sums over frames for each track of the point, (B, P, D, tracks).
+    """
     m, size = objective.measurements, root.shape[-1]
-    weights = worth[..., None] * correlation.spectrum(m.frames) - 1
+    weights = correlation.spectrum(m.frames) - 1
     weights[..., 1:-1] *= 2
     weights = (weights / (2 * m.frames)).to(torch.float32)
-    excess, squares = root.new_zeros(m.sessions, size, size), torch.zeros_like(worth)
+    white, lasting = (root.new_zeros(m.sessions, m.points_per_frame, size, size) for _ in range(2))
     sums = root.new_empty(m.sessions, m.points_per_frame, size, m.num_cameras, 2)
     together = max(1, _SPECTRUM_VALUES // (4 * m.sessions * size * 2 * m.frames))
     for camera, derivatives in enumerate(_derivatives(objective, state, root)):
-        by_track = derivatives.unflatten(-1, (m.frames, -1)).permute(0, 4, 1, 2, 3)
+        by_track = derivatives.unflatten(-1, (m.frames, -1)).permute(0, 4, 1, 2, 3).to(torch.float32)
         sums[..., camera, :] = by_track.sum(-1)
-        squares += by_track.square().sum((2, 3, 4))
         for first in range(0, m.points_per_frame, together):
             part = slice(first, first + together)
-            spectrum = torch.view_as_real(torch.fft.rfft(by_track[:, part].to(torch.float32), n=2 * m.frames))
+            flat = by_track[:, part].flatten(3)
+            white[:, part] += flat @ flat.mT
+            spectrum = torch.view_as_real(torch.fft.rfft(by_track[:, part], n=2 * m.frames))
             weighted = spectrum * weights[:, part, None, None, :, None]
-            flat, weighted = (x.transpose(1, 2).flatten(2) for x in (spectrum, weighted))
-            excess += flat @ weighted.mT
-    return excess, squares, sums.flatten(3)
+            lasting[:, part] += weighted.flatten(3) @ spectrum.flatten(3).mT
+    return white, lasting, sums.flatten(3)
 
 
 def _derivatives(objective: Objective, state: State, root: Tensor) -> Iterator[Tensor]:
