@@ -10,8 +10,8 @@ import torch
 
 from torchstickcal import Calibration, ConfigError, ObservationError, Observations, calibrate
 from torchstickcal.metrics import pose_errors
+from torchstickcal.model.correlation import error_correlation
 from torchstickcal.model.measurements import Measurements
-from torchstickcal.model.noise import residual_correlation
 from torchstickcal.model.state import State
 from torchstickcal.simulate import Clocks, SessionSpec, SimulatedSession
 from torchstickcal.simulate.regimes import GaussianNoise
@@ -208,4 +208,5 @@ def test_residuals_that_are_alike_are_noticed(correlation: float):
     points = truth.points[:1].expand(400, -1, -1).flatten(0, 1).mT[None].contiguous()
     state = State.of(truth.rotations[None], truth.translations[None], points)
     sigma_px = torch.ones(1, given.num_points, dtype=torch.float64)
-    assert residual_correlation(measurements, state, sigma_px) == pytest.approx(correlation, abs=0.02)
+    found = error_correlation(measurements, state, sigma_px).values[0, :, 1]
+    assert float(found.mean()) == pytest.approx(correlation, abs=0.02)

@@ -30,6 +30,7 @@ _LEAST_PAIRS = 30
 _LEAST_VARIANCE = 0.05
 """Squared residual, in units of the noise, below which residuals are rounding errors."""
 _LARGEST_AMPLITUDE = 10.0
+_FARTHEST = 1.0
 _MEAN_BY_CHANCE = 0.8
 """Mean of a positive quantity of which zero was found, in standard deviations of the estimate."""
 _VALUES_AT_ONCE = 2**22
@@ -61,7 +62,7 @@ class ErrorCorrelation:
         return 1 + 2 * self.values[..., 1:] @ found
 
     def spectrum(self, frames: int) -> Tensor:
-        """Power of the errors at the frequencies of ``rfft`` over 2 ``frames`` frames, (B, P, frames + 1), 0 or more, mean 1."""
+        """Power of the errors at the frequencies of ``rfft`` over 2 ``frames`` frames, (B, P, frames + 1), mean 1."""
         lags = pad(self.values, (0, max(0, frames - self.values.shape[-1])))[..., :frames]
         around = torch.cat([lags, torch.zeros_like(lags[..., :1]), lags[..., 1:].flip(-1)], dim=-1)
         power = torch.fft.rfft(around).real.clamp_min(0.0)
@@ -198,5 +199,5 @@ def _amplitudes(products: Tensor, pairs: Tensor, common: Tensor, independent: Te
     nothing = (own < least) & (least < (-_SIGNIFICANT_OF_POINT * scatter.sqrt()).exp())
     own = torch.maximum(own, least).clamp_max(_LARGEST_AMPLITUDE)
     sampling = by_chance / own.square() + scatter
-    drawn = shrunk_logarithms(own.log(), sampling, independent > 0, contrast).exp()
+    drawn = shrunk_logarithms(own.log(), sampling, independent > 0, contrast, _FARTHEST).exp()
     return drawn.where(~nothing, _MEAN_BY_CHANCE * by_chance.sqrt())

@@ -1,4 +1,4 @@
-"""Estimates from the data: noise of the keypoints, correlation of the residuals, and acceleration of the points."""
+"""Estimates from the data: noise of the keypoints, and acceleration of the points."""
 
 from __future__ import annotations
 
@@ -11,7 +11,6 @@ from torchstickcal.losses import SmoothnessLoss
 from torchstickcal.losses.track import combined, consecutive
 from torchstickcal.model.measurements import Measurements
 from torchstickcal.model.shrinkage import shrunk_logarithms
-from torchstickcal.model.state import State
 
 _CUT = 4.0
 """Residual, in standard deviations, beyond which a keypoint counts as an outlier in the estimate of the noise."""
@@ -49,30 +48,6 @@ def estimate_sigma_px(measurements: Measurements, squared_residuals: Tensor) -> 
         variance = sums / degrees_of_freedom.clamp_min(1) / _truncated_moment(_CUT)
         variance = _shrink(variance.clamp_min(_MIN_SIGMA_PX**2), degrees_of_freedom)
     return variance.sqrt()
-
-
-def residual_correlation(measurements: Measurements, state: State, sigma_px: Tensor) -> float:
-    """Autocorrelation r of the residuals of a track between consecutive frames, 0 to 1.
-
-    Independent noise has r = 0. Model errors of a camera, and detector errors that last for several frames, have an r near 1.
-    With an exponentially decaying autocorrelation, n residuals have the information of ``n (1 - r) / (1 + r)`` independent
-    residuals.
-
-    Args:
-        measurements: the inliers.
-        state: the solution.
-        sigma_px: noise of each point's keypoints, (B, P).
-    """
-    m = measurements
-    products, squares = torch.zeros(2, dtype=torch.float64, device=state.points.device)
-    for columns, residuals, _ in m.residuals(state):
-        seen = m.visible[..., columns].unsqueeze(-2)
-        residuals = residuals.where(seen, torch.nan).double().unflatten(-1, (-1, m.points_per_frame))
-        residuals = residuals / sigma_px[:, None, None, None]
-        before, after = residuals[..., :-1, :], residuals[..., 1:, :]
-        products += (before * after).nansum()
-        squares += (before.square() + after.square()).where((before * after).isfinite(), 0.0).sum() / 2
-    return float((products / squares.clamp_min(1e-300)).clamp(0.0, 1.0))
 
 
 def estimate_acceleration_m(measurements: Measurements, points: Tensor, point_variance: Tensor) -> Tensor:

@@ -14,7 +14,7 @@ from torchstickcal.pipeline.check import CameraCheck
 from torchstickcal.pipeline.synchronise import ClockEstimate, CommonFrames
 from torchstickcal.pipeline.warnings import warnings_of
 from torchstickcal.result import Calibration, CameraParameter
-from torchstickcal.solvers.uncertainty import camera_covariance, likelihood
+from torchstickcal.solvers.uncertainty import camera_covariance, likelihood, ruler_covariance
 
 
 def conclude(
@@ -92,7 +92,8 @@ def _covariance(ended: Adjustment) -> Tensor:
     kept = measurements.keeping(last.inliers & ended.agreeing_cameras[..., None])
     sigma_px, times = ended.last.sigma_px, last.correlation_frames
     correlation = error_correlation(kept, last.state, sigma_px)
-    return camera_covariance(likelihood(kept, last.losses, sigma_px * times.sqrt()), last.state, correlation, times)[0]
+    noise = camera_covariance(likelihood(kept, last.losses, sigma_px * times.sqrt()), last.state, correlation, times)[0]
+    return noise + ruler_covariance(kept, last.state, sigma_px)
 
 
 def _unknowns(ended: Adjustment, check: CameraCheck, covariance: Tensor) -> dict[str, CameraParameter]:

@@ -68,6 +68,28 @@ def camera_covariance(
     return root @ inflation(objective, state, root, correlation, times) @ root.mT
 
 
+def ruler_covariance(measurements: Measurements, state: State, sigma_px: Tensor) -> Tensor:
+    """Covariance that errors of the sticks' given lengths add, (6 (C - 1) + K, 6 (C - 1) + K), for one session.
+
+    A length that is wrong is wrong in every frame: the whole scene has another scale. Where several sticks are given, each has
+    the share of the scale that it determines.
+
+    Args:
+        measurements: the inliers.
+        state: the solution.
+        sigma_px: noise of each point's keypoints, (B, P).
+    """
+    m = measurements
+    centres = (state.rotations[0].mT @ state.translations[0][..., None])[1:, :, 0]
+    tangents = torch.nn.functional.pad(centres, (0, 3)).flatten()
+    direction = torch.nn.functional.pad(tangents, (0, m.unknowns.count))
+    noise = m.by_frame(point_variances(m, state, sigma_px))[0][:, m.sticks].sum(-1)
+    tolerance, lengths = m.stick_sigma_m, m.lengths_m[0]
+    information = (lengths.square() / (tolerance.square() + noise)).where(m.stick_active[0], 0.0).sum(0)
+    share = information / information.sum().clamp_min(1e-300)
+    return (share * tolerance / lengths).square().sum() * torch.outer(direction, direction)
+
+
 def point_variances(measurements: Measurements, state: State, sigma_px: Tensor) -> Tensor:
     """Variance of each point for known cameras, mean over the three axes, (B, N), square metres. Infinite for points not seen.
 
