@@ -17,17 +17,21 @@ from torch import Tensor
 
 from torchstickcal.geometry.singular import covariance_of, solve_information
 from torchstickcal.lazy import cached_property
-from torchstickcal.model.correlation import error_correlation
+from torchstickcal.model.correlation import ErrorCorrelation, error_correlation
 from torchstickcal.model.measurements import Measurements
 from torchstickcal.model.objective import Objective
 from torchstickcal.model.state import State
 from torchstickcal.model.unknowns import RigUnknowns, all_unknowns, with_refinements
 from torchstickcal.pipeline.adjust import Adjustment
+from torchstickcal.solvers import Termination, ignore_record
 from torchstickcal.solvers.elimination.normal_equations import NormalEquations
+from torchstickcal.solvers.gauss_newton import gauss_newton
 from torchstickcal.solvers.uncertainty import camera_covariance, likelihood
 
 _CHECKED_FRAMES = 5000
 _SIGMAS = 4.0
+_STEPS = 8
+"""Most steps to the least cost with all lenses and clocks unknown."""
 _FRAME_FOLDS, _POINT_FOLDS = 4, 3
 """Parts of the frames and of the points that in turn take no part in finding what is refined, and judge it."""
 _PRICE = 4.0
@@ -68,16 +72,16 @@ class CameraCheck:
         self._choices: dict[tuple[str, ...], tuple[Tensor, RigUnknowns]] = {}
         self._variants = {unknown.name: next(iter(unknown.variants)) for unknown in all_unknowns().values()}
         self._every = RigUnknowns.of(tuple(self._variants.values()), cameras, groups)
-        sigma_px, times = result.sigma_px, part.last_camera_stage.correlation_frames
+        sigma_px = result.sigma_px
         self._state = replace(state, unknowns=self._every.given)
         losses = part.last_camera_stage.losses
-        self._objective = likelihood(_with_every_unknown(kept, state, self._every), losses, sigma_px * times.sqrt())
+        self._objective = likelihood(_with_every_unknown(kept, state, self._every), losses, sigma_px)
         system = NormalEquations(self._objective, self._state, cameras_free=True)
         self._information, self._gradient = system.reduced[0], system.reduced_gradient[0]
         self._gradient_covariance = self._information
-        correlation = error_correlation(kept, state, sigma_px)
+        correlation = _unexplained_correlation(self._objective, self._state, sigma_px)
         if correlation.lasts:
-            covariance = camera_covariance(self._objective, self._state, correlation, times)[0]
+            covariance = camera_covariance(self._objective, self._state, correlation)[0]
             self._gradient_covariance = self._information @ covariance @ self._information
 
     def suggestions(self) -> dict[str, Suggestion]:
@@ -199,23 +203,32 @@ def _blocks(frames: int, count: int) -> list[slice]:
 
 
 def _point_groups(objective: Objective) -> list[Tensor]:
-    """Masks (N,) of groups of points; those that a loss couples are in one group. Empty where there are too few points."""
-    m, clusters = objective.measurements, objective.clusters
-    coupled = {point for cluster in clusters for point in cluster}
-    together = [*clusters, *((point,) for point in range(m.points_per_frame) if point not in coupled)]
-    if len(together) < 2 * _POINT_FOLDS:
+    """Masks (N,) of groups of points that no loss couples: sticks, which set the scale, are never left out. Often empty."""
+    m = objective.measurements
+    coupled = {point for cluster in objective.clusters for point in cluster}
+    single = [point for point in range(m.points_per_frame) if point not in coupled]
+    if len(single) < 2 * _POINT_FOLDS:
         return []
-    groups: list[Tensor] = []
-    for number in range(_POINT_FOLDS):
-        kept = torch.zeros(m.points_per_frame, dtype=torch.bool, device=m.pixels.device)
-        kept[[point for cluster in together[number::_POINT_FOLDS] for point in cluster]] = True
-        groups.append(kept.repeat(m.frames))
-    return groups
+    groups = m.confidence.new_zeros(_POINT_FOLDS, m.points_per_frame, dtype=torch.bool)
+    for number, group in enumerate(groups):
+        group[single[number::_POINT_FOLDS]] = True
+    return [group.repeat(m.frames) for group in groups]
 
 
 def _certain(gains: Tensor) -> bool:
     """Whether the mean of some gains is above zero by more than its standard error."""
     return float(gains.mean()) > float(gains.std()) / len(gains) ** 0.5
+
+
+def _unexplained_correlation(objective: Objective, state: State, sigma_px: Tensor) -> ErrorCorrelation:
+    """The correlation of the errors that no lens and no clock explains: near the least cost with all of them unknown."""
+    correlation = error_correlation(objective.measurements, state, sigma_px)
+    if not correlation.lasts:
+        return correlation
+    outcome = gauss_newton(
+        objective, state, cameras_free=True, termination=Termination(_STEPS), stage="check", listener=ignore_record
+    )
+    return error_correlation(objective.measurements, outcome.state, sigma_px)
 
 
 def _choices() -> Iterator[tuple[str, ...]]:
