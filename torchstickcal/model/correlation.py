@@ -12,7 +12,6 @@ from dataclasses import dataclass
 
 import torch
 from torch import Tensor
-from torch.nn.functional import pad
 
 from torchstickcal.model.measurements import Measurements
 from torchstickcal.model.shrinkage import shrunk_logarithms
@@ -63,8 +62,8 @@ class ErrorCorrelation:
 
     def spectrum(self, frames: int) -> Tensor:
         """Power of the errors at the frequencies of ``rfft`` over 2 ``frames`` frames, (B, P, frames + 1), mean 1."""
-        lags = pad(self.values, (0, max(0, frames - self.values.shape[-1])))[..., :frames]
-        around = torch.cat([lags, torch.zeros_like(lags[..., :1]), lags[..., 1:].flip(-1)], dim=-1)
+        lags = self.values[..., :frames]
+        around = torch.cat([lags, lags[..., -1:], lags[..., 1:].flip(-1)], dim=-1)
         power = torch.fft.rfft(around).real.clamp_min(0.0)
         return power / ((2 * power.sum(-1) - power[..., 0] - power[..., -1]) / (2 * frames))[..., None]
 

@@ -54,7 +54,7 @@ def inflation(objective: Objective, state: State, root: Tensor, correlation: Err
     white, lasting = (root.new_zeros(m.sessions, m.points_per_frame, *root.shape[1:]) for _ in range(2))
     sums: list[Tensor] = []
     for frames in segments:
-        parts = _within_segment(*_cut(objective, state, frames), root, correlation)
+        parts = _within_segment(*_cut(objective, state, frames), root, correlation, bool((times != 1).any()))
         white, lasting = white + parts[0], lasting + parts[1]
         sums.append(parts[2])
     for step in range(1, len(segments)):
@@ -105,11 +105,11 @@ def _cut(objective: Objective, state: State, frames: slice) -> tuple[Objective, 
 
 
 def _within_segment(
-    objective: Objective, state: State, root: Tensor, correlation: ErrorCorrelation
+    objective: Objective, state: State, root: Tensor, correlation: ErrorCorrelation, with_white: bool
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Each point's sums over one segment: ``Q^T A A^T Q`` and ``Q^T A (T - I) A^T Q``, (B, P, D, D), and of ``Q^T A``.
 
-    The last ones are sums over frames for each track of the point, (B, P, D, tracks).
+    The first are zero where they are not wanted. The last are sums over frames for each track of the point, (B, P, D, tracks).
     """
     m, size = objective.measurements, root.shape[-1]
     weights = correlation.spectrum(m.frames) - 1
@@ -124,7 +124,8 @@ def _within_segment(
         for first in range(0, m.points_per_frame, together):
             part = slice(first, first + together)
             flat = by_track[:, part].flatten(3)
-            white[:, part] += flat @ flat.mT
+            if with_white:
+                white[:, part] += flat @ flat.mT
             spectrum = torch.view_as_real(torch.fft.rfft(by_track[:, part], n=2 * m.frames))
             weighted = spectrum * weights[:, part, None, None, :, None]
             lasting[:, part] += weighted.flatten(3) @ spectrum.flatten(3).mT
