@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from typing import NamedTuple, Protocol
+from typing import NamedTuple, Protocol, Self
 
 import torch
 from torch import Tensor
@@ -73,6 +73,11 @@ class CameraPointLoss(Loss, ABC):
             keypoints: (..., C, n, 2), pixels.
             intrinsics: the C cameras.
         """
+
+    def of_columns(self, columns: slice | Tensor, points: int) -> Self:
+        """The loss as it is applied to some columns, of ``points`` points side by side in each frame; here the same."""
+        del columns, points
+        return self
 
     @in_full_precision
     def forward(

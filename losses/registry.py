@@ -23,12 +23,15 @@ class LossContext:
         point: gives the index of a named point; raises ObservationError if no point has the name.
         stick_sigma_m: (S,), tolerances of the sticks' lengths, metres.
         sigma_px: (B, P), estimated noise of each point's keypoints, pixels.
+        correlation_frames: gives the numbers (B, P) of keypoints that count as one, because their errors are alike; for
+            ``estimated``, or for a number of frames.
         acceleration_m: estimates (B, P), the standard deviation of each point's second difference over frames, metres.
     """
 
     point: Callable[[str], int]
     stick_sigma_m: Tensor
     sigma_px: Tensor
+    correlation_frames: Callable[[float | str], Tensor]
     acceleration_m: Callable[[], Tensor]
 
 

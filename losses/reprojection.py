@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Literal, Self
+from typing import Any, Literal, Self
 
 import torch
 from torch import Tensor
@@ -13,7 +14,7 @@ from torchstickcal.geometry.cameras import Intrinsics, PixelMap, inverse_depths
 from torchstickcal.geometry.symmetric import symmetric_product
 from torchstickcal.losses.camera_point import CameraPointLoss, CameraPointTerms, CameraUnknownsAt, UnknownTerms
 from torchstickcal.losses.registry import LossContext, LossSettings, register_loss
-from torchstickcal.losses.robust import robust_kernel
+from torchstickcal.losses.robust import Quadratic, Repeated, RobustKernel, robust_kernel
 from torchstickcal.settings import Positive
 
 
@@ -48,6 +49,7 @@ class ReprojectionLoss(CameraPointLoss):
         sigma: noise of a keypoint in pixels, one number or one per point (P,).
         weight: factor on the loss.
         kernel: robust kernel; None for least squares.
+        times: (B, 1, 1, P), as many keypoints of a point count as one, because their errors are alike; None for 1.
 
     Example:
         >>> import torch
@@ -56,6 +58,43 @@ class ReprojectionLoss(CameraPointLoss):
         >>> ReprojectionLoss(sigma=2.0)(points, torch.eye(3)[None], torch.zeros(1, 3), keypoints, matrix)
         tensor(1.2500)
     """
+
+    def __init__(
+        self,
+        sigma: float | Tensor = 1.0,
+        weight: float = 1.0,
+        kernel: RobustKernel | None = None,
+        times: Tensor | None = None,
+    ) -> None:
+        if times is None:
+            super().__init__(sigma, weight, kernel)
+        else:
+            super().__init__(sigma * times.sqrt(), weight, Repeated(kernel or Quadratic(), times))
+
+    def of(self, sessions: slice) -> Self:
+        return super().of(sessions)._repeated(lambda times: times[sessions])
+
+    def replaced(self, where: Tensor, other: Any) -> Self:
+        return (
+            super()
+            .replaced(where, other)
+            ._repeated(
+                lambda times: (
+                    torch.where(where[:, None, None, None], other.kernel.times, times)
+                    if isinstance(other.kernel, Repeated)
+                    else times
+                )
+            )
+        )
+
+    def of_columns(self, columns: slice | Tensor, points: int) -> Self:
+        return self._repeated(lambda times: times[..., 0, _points_of(columns, points).to(times.device)])
+
+    def _repeated(self, change: Callable[[Tensor], Tensor]) -> Self:
+        """The loss with its ``times`` changed, where it has them."""
+        if not isinstance(self.kernel, Repeated):
+            return self
+        return self._with(kernel=Repeated(self.kernel.kernel, change(self.kernel.times)))
 
     def residuals(self, points_cam: Tensor, keypoints: Tensor, intrinsics: Intrinsics) -> Tensor:
         return projection.project(points_cam, intrinsics) - keypoints
@@ -158,18 +197,30 @@ class ReprojectionSettings(LossSettings):
         kernel: robust kernel.
         kernel_scale: residual in standard deviations from which on a keypoint counts for less; None for the kernel's default.
         weight: factor on the loss.
+        correlation_frames: for how many frames errors last: as many keypoints of a point count as one. ``estimated`` takes it
+            from the session, for each point.
     """
 
     sigma_px: Positive | Literal["estimated"] = "estimated"
     kernel: Literal["none", "cauchy", "huber", "geman_mcclure"] = "none"
     kernel_scale: Positive | None = None
     weight: Positive = 1.0
+    correlation_frames: Positive | Literal["estimated"] = 1.0
 
     loss = ReprojectionLoss
 
     def build(self, context: LossContext) -> ReprojectionLoss:
         sigma = context.sigma_px[:, None, None] if self.sigma_px == "estimated" else self.sigma_px
-        return ReprojectionLoss(sigma, self.weight, robust_kernel(self.kernel, self.kernel_scale))
+        kernel = robust_kernel(self.kernel, self.kernel_scale)
+        if self.correlation_frames == 1.0:
+            return ReprojectionLoss(sigma, self.weight, kernel)
+        times = context.correlation_frames(self.correlation_frames)[:, None, None]
+        return ReprojectionLoss(sigma, self.weight, kernel, times)
+
+
+def _points_of(columns: slice | Tensor, points: int) -> Tensor:
+    """The points that some columns are of, with ``points`` points in each frame."""
+    return (torch.arange(columns.start, columns.stop) if isinstance(columns, slice) else columns) % points
 
 
 def _by_unknowns(

@@ -104,6 +104,29 @@ class GemanMcClure:
         return -2 / self.scale**2 * (1 + squared / self.scale**2).pow(-3)
 
 
+@dataclass(frozen=True)
+class Repeated:
+    """A kernel for residuals of which n count as one: rho(s) = kernel(n s) / n, where s is the squared residual over n.
+
+    A residual is judged by itself, with its own standard deviation, but has only 1 / n of its information.
+    """
+
+    kernel: RobustKernel
+    times: Tensor
+    """n, 1 or more; it broadcasts against the squared residuals"""
+
+    def rho(self, squared: Tensor) -> Tensor:
+        times = self.times.to(squared)
+        return self.kernel.rho(times * squared) / times
+
+    def weight(self, squared: Tensor) -> Tensor:
+        return self.kernel.weight(self.times.to(squared) * squared)
+
+    def curvature(self, squared: Tensor) -> Tensor:
+        times = self.times.to(squared)
+        return times * self.kernel.curvature(times * squared)
+
+
 _KERNELS = {"none": Quadratic, "cauchy": Cauchy, "huber": Huber, "geman_mcclure": GemanMcClure}
 
 

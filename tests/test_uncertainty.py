@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 import torch
 
@@ -103,7 +105,8 @@ def test_covariance_agrees_with_simulated_errors():
     runs, normalised, ratios = 25, [], []
     for seed in range(runs):
         observations, truth = golf_session(cameras=4, frames=25, noise=Noise(sigma_px=1.0), seed=seed)
-        calibration = calibrate(observations)
+        exact = replace(observations, sticks=tuple(replace(stick, sigma_m=1e-5) for stick in observations.sticks))
+        calibration = calibrate(exact)
         error = deviation(calibration, truth)
         normalised.append(float(error @ torch.linalg.solve(calibration.covariance, error)) / len(error))
         ratios.append(squared_error_over_predicted(calibration, observations, truth, seed))

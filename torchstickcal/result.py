@@ -112,8 +112,8 @@ class Calibration:
     frames of the session, unless time offsets were estimated or timestamps were given."""
     covariance: Tensor
     """(6 (C - 1), 6 (C - 1)), float64, of the tangents (translation, rotation; metres, radians) of all cameras but the first,
-    which is the world: ``T_true = T Exp(tangent)``. It holds for normal noise, and for sticks whose lengths are right within
-    their stated deviations."""
+    which is the world: ``T_true = T Exp(tangent)``. It contains errors of the keypoints that last for several frames, and the
+    stated deviations of the sticks' lengths, which are common to all frames."""
     residuals_px: Tensor
     """(C, F, P, 2), projection minus keypoint, pixels, of inliers and outliers; NaN where not seen or the point is not known"""
     inliers: Tensor

@@ -25,8 +25,9 @@ class Stick:
         start: one end, as the index of a point or as its name.
         end: the other end.
         length_m: length in metres.
-        sigma_m: standard deviation of the length, metres: how well it was measured and how rigid the stick is. A limb that
-            stands in for a stick is known to a few centimetres at best.
+        sigma_m: standard deviation of the length, metres: how well it was measured and how rigid the stick is. Its error is the
+            same in all frames and enters the scale's deviation. A limb that stands in for a stick is known to a few centimetres
+            at best.
 
     Raises:
         ObservationError: if the ends are no points or the same one, or the length or its deviation are no lengths in metres.

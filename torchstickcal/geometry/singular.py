@@ -41,13 +41,22 @@ def covariance_of(information: Tensor) -> Tensor:
         >>> covariance_of(torch.tensor([[4.0, 0.0], [0.0, 0.0]], dtype=torch.float64)).diagonal().tolist()
         [0.25, 1000000000000.0]
     """
+    root = covariance_root(information)
+    return root @ root.mT
+
+
+def covariance_root(information: Tensor) -> Tensor:
+    """Roots Q (..., K, K) of the covariances Q Q^T of :func:`covariance_of`.
+
+    Example:
+        >>> covariance_root(torch.tensor([[4.0, 0.0], [0.0, 1.0]], dtype=torch.float64)).square().sum(-1).tolist()
+        [0.25, 1.0]
+    """
     values, vectors, determined = _directions(information)
     variances = torch.where(determined, values, _SINGULAR * values[..., -1:].clamp_min(1e-300)).reciprocal()
-    covariance = (vectors * variances[..., None, :]) @ vectors.mT
+    root = vectors * variances.sqrt()[..., None, :]
     nothing = ~vectors.any(-1)
-    covariance = covariance.masked_fill(nothing[..., None] | nothing[..., None, :], 0.0)
-    covariance.diagonal(dim1=-2, dim2=-1).masked_fill_(nothing, _UNKNOWN_VARIANCE)
-    return covariance
+    return root + (nothing * _UNKNOWN_VARIANCE**0.5).diag_embed().to(root)
 
 
 def _directions(information: Tensor) -> tuple[Tensor, Tensor, Tensor]:

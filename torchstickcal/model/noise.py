@@ -1,4 +1,4 @@
-"""Estimates from the data: noise of the keypoints, correlation of the residuals, and acceleration of the points."""
+"""Estimates from the data: noise of the keypoints, and acceleration of the points."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from torch import Tensor
 from torchstickcal.losses import SmoothnessLoss
 from torchstickcal.losses.track import combined, consecutive
 from torchstickcal.model.measurements import Measurements
-from torchstickcal.model.state import State
+from torchstickcal.model.shrinkage import shrunk_logarithms
 
 _CUT = 3.5
 """Residual, in standard deviations, beyond which a keypoint takes no part in the estimate of the noise. With a wide cut,
@@ -52,30 +52,6 @@ def estimate_sigma_px(measurements: Measurements, squared_residuals: Tensor) -> 
         variance = squared.where(inliers, 0.0).sum((1, 2)) / expected
         variance = _shrink(variance.clamp_min(_MIN_SIGMA_PX**2), degrees_of_freedom)
     return variance.sqrt()
-
-
-def residual_correlation(measurements: Measurements, state: State, sigma_px: Tensor) -> float:
-    """Autocorrelation r of the residuals of a track between consecutive frames, 0 to 1.
-
-    Independent noise has r = 0. Model errors of a camera, and detector errors that last for several frames, have an r near 1.
-    With an exponentially decaying autocorrelation, n residuals have the information of ``n (1 - r) / (1 + r)`` independent
-    residuals.
-
-    Args:
-        measurements: the inliers.
-        state: the solution.
-        sigma_px: noise of each point's keypoints, (B, P).
-    """
-    m = measurements
-    products, squares = torch.zeros(2, dtype=torch.float64, device=state.points.device)
-    for columns, residuals, _ in m.residuals(state):
-        seen = m.visible[..., columns].unsqueeze(-2)
-        residuals = residuals.where(seen, torch.nan).double().unflatten(-1, (-1, m.points_per_frame))
-        residuals = residuals / sigma_px[:, None, None, None]
-        before, after = residuals[..., :-1, :], residuals[..., 1:, :]
-        products += (before * after).nansum()
-        squares += (before.square() + after.square()).where((before * after).isfinite(), 0.0).sum() / 2
-    return float((products / squares.clamp_min(1e-300)).clamp(0.0, 1.0))
 
 
 def estimate_acceleration_m(measurements: Measurements, points: Tensor, point_variance: Tensor) -> Tensor:
@@ -144,19 +120,6 @@ def _degrees(cameras: int) -> Tensor:
 
 
 def _shrink(variance: Tensor, degrees_of_freedom: Tensor) -> Tensor:
-    """Variances (B, P), their logarithms shrunk towards the mean of their session.
-
-    The sampling variance of a log variance is ``2 / degrees_of_freedom``. The variance between points is what the observed
-    variance of the log variances has beyond that.
-    """
+    """Variances (B, P), their logarithms, of sampling variance ``2 / degrees_of_freedom``, shrunk towards their mean."""
     sampling = 2 / degrees_of_freedom.clamp_min(0.1)
-    logs = variance.log()
-    weights = sampling.reciprocal() * (degrees_of_freedom > 0)
-    mean = _weighted_mean(logs, weights)
-    between = _weighted_mean((logs - mean).square() - sampling, weights).clamp_min(0.0)
-    mean = _weighted_mean(logs, 1 / (between + sampling))
-    return (mean + (logs - mean) * between / (between + sampling)).exp()
-
-
-def _weighted_mean(values: Tensor, weights: Tensor) -> Tensor:
-    return (values * weights).sum(1, keepdim=True) / weights.sum(1, keepdim=True).clamp_min(1e-300)
+    return shrunk_logarithms(variance.log(), sampling, degrees_of_freedom > 0).exp()

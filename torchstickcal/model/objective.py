@@ -54,6 +54,10 @@ class Objective:
         """The objective of some of the sessions."""
         return Objective(self.measurements[sessions], {name: loss.of(sessions) for name, loss in self.losses.items()})
 
+    def information_of(self, name: str) -> Tensor:
+        """1 / sigma^2 of a camera-point loss at every column, (1 | B, 1, N)."""
+        return self._information[name]
+
     @property
     def track_losses(self) -> dict[str, TrackLoss]:
         """The losses that couple consecutive frames."""
@@ -106,6 +110,7 @@ class Objective:
         total = (state.unknowns * unknown_step / m.unknowns.prior_sigma.square()).sum()
         for name, loss in self._camera_point.items():
             information = m.confidence * self._information[name]
+            loss = loss.of_columns(slice(0, m.num_columns), m.points_per_frame)
             total = total + loss.slope(points_cam, moved_cam, at.pixels, information, at.cameras, at.if_any, step)
         points, point_step, active = m.by_frame(state.points), m.by_frame(point_step), m.by_frame(m.active)
         for loss in self._frame.values():
@@ -126,6 +131,7 @@ class Objective:
         for name, loss in self._camera_point.items():
             information = confidence * self._information[name][..., columns]
             further = None if exact else unknowns
+            loss = loss.of_columns(columns, m.points_per_frame)
             terms = loss.linearise(points_cam, rotations, at.pixels, information, at.cameras, exact, further)
             if unknowns is not None and exact:
                 terms = terms._replace(unknown=self._exact_by_unknowns(loss, state, columns, information))

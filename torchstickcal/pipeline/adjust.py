@@ -36,6 +36,9 @@ from torchstickcal.solvers import StageRecord
 
 _INITIALISE, _RELABEL = "initialise", "relabel"
 _MAX_RELABELLINGS = 3
+_MOST_ROUNDS = 6
+_SETTLED = 0.1
+"""Relative change of the numbers of keypoints that count as one, below which a stage need not be repeated with new ones."""
 
 
 @dataclass(frozen=True)
@@ -312,8 +315,18 @@ def points_used(observations: Observations, config: Config) -> list[int] | None:
 
 
 def _through(stages: Iterable[tuple[str, Stage]], adjustment: Adjustment, run: Run) -> Adjustment:
+    """After some stages. One in which keypoints count as fewer is repeated, until what they count no longer changes.
+
+    Errors that last are hidden in the cameras, as long as points with such errors determine them.
+    """
     for name, stage in stages:
-        adjustment = adjustment.ended(run_stage(name, stage, adjustment.measurements, adjustment.state, run))
+        before = torch.ones_like(adjustment.state.points[:, 0, :1])
+        for _ in range(_MOST_ROUNDS):
+            adjustment = adjustment.ended(run_stage(name, stage, adjustment.measurements, adjustment.state, run))
+            times = adjustment.last.correlation_frames
+            if bool(((times / before).log().abs() < _SETTLED).all()):
+                break
+            before = times
     return adjustment
 
 

@@ -16,17 +16,24 @@ import torch
 from torch import Tensor
 
 from torchstickcal.geometry.singular import covariance_of, solve_information
+from torchstickcal.lazy import cached_property
+from torchstickcal.model.correlation import ErrorCorrelation, error_correlation
 from torchstickcal.model.measurements import Measurements
-from torchstickcal.model.noise import residual_correlation
+from torchstickcal.model.objective import Objective
 from torchstickcal.model.state import State
 from torchstickcal.model.unknowns import RigUnknowns, all_unknowns, with_refinements
 from torchstickcal.pipeline.adjust import Adjustment
+from torchstickcal.solvers import Termination, ignore_record
 from torchstickcal.solvers.elimination.normal_equations import NormalEquations
-from torchstickcal.solvers.uncertainty import likelihood
+from torchstickcal.solvers.gauss_newton import gauss_newton
+from torchstickcal.solvers.uncertainty import camera_covariance, likelihood
 
 _CHECKED_FRAMES = 5000
 _SIGMAS = 4.0
-_LEAST_EVIDENCE = 1e-6
+_STEPS = 8
+"""Most steps to the least cost with all lenses and clocks unknown."""
+_FRAME_FOLDS, _POINT_FOLDS = 4, 3
+"""Parts of the frames and of the points that in turn take no part in finding what is refined, and judge it."""
 _PRICE = 4.0
 """Decrease of the cost that each further unknown has to bring, in units of a squared standard deviation; chance brings 1."""
 
@@ -38,6 +45,13 @@ class Suggestion(NamedTuple):
     """(C, n)"""
     std: Tensor
     """(C, n)"""
+
+
+class Fold(NamedTuple):
+    """A part of the keypoints: its share of the system of poses and all unknowns, without the prior."""
+
+    information: Tensor
+    gradient: Tensor
 
 
 class CameraCheck:
@@ -58,12 +72,17 @@ class CameraCheck:
         self._choices: dict[tuple[str, ...], tuple[Tensor, RigUnknowns]] = {}
         self._variants = {unknown.name: next(iter(unknown.variants)) for unknown in all_unknowns().values()}
         self._every = RigUnknowns.of(tuple(self._variants.values()), cameras, groups)
-        examined = _with_every_unknown(kept, state, self._every)
-        objective = likelihood(examined, part.last_camera_stage.losses, result.sigma_px)
-        system = NormalEquations(objective, replace(state, unknowns=self._every.given), cameras_free=True)
+        sigma_px = result.sigma_px
+        self._state = replace(state, unknowns=self._every.given)
+        losses = part.last_camera_stage.losses
+        self._objective = likelihood(_with_every_unknown(kept, state, self._every), losses, sigma_px)
+        system = NormalEquations(self._objective, self._state, cameras_free=True)
         self._information, self._gradient = system.reduced[0], system.reduced_gradient[0]
-        correlation = residual_correlation(kept, state, result.sigma_px)
-        self._evidence = (1 - correlation) / (1 + correlation)
+        self._gradient_covariance = self._information
+        correlation = _unexplained_correlation(self._objective, self._state, sigma_px)
+        if correlation.lasts:
+            covariance = camera_covariance(self._objective, self._state, correlation)[0]
+            self._gradient_covariance = self._information @ covariance @ self._information
 
     def suggestions(self) -> dict[str, Suggestion]:
         """What the keypoints suggest for each unknown by itself, by its name."""
@@ -89,31 +108,56 @@ class CameraCheck:
             if names in failed or not set(names) <= set(allowed) or with_refinements(refined, names) == tuple(refined):
                 continue
             gain = self._gain(names)
-            if gain > best:
+            if gain > best and self._predicts(names):
                 best, choice = gain, names
         return choice
 
     def _gain(self, names: tuple[str, ...]) -> float:
-        """Decrease of the cost that a choice promises, less a price for each of its unknowns.
+        """Squared length of a choice's values in their standard deviations, less a price for each of its unknowns.
 
-        Residuals that are alike from frame to frame count as the smaller number of independent ones that they are worth.
+        Where the errors of the keypoints are independent, it is the decrease of the cost that the choice promises.
         """
-        promised = self._evidence * (self._decrease(names) - self._decrease(()))
-        _, unknowns = self._chosen(names)
-        return promised - _PRICE * unknowns.count
+        unknowns, values, covariance = self._solved(names)
+        return float(values @ solve_information(covariance, values)) - _PRICE * unknowns.count
 
-    def _decrease(self, names: tuple[str, ...]) -> float:
-        chosen, _ = self._chosen(names)
-        gradient = chosen.mT @ self._gradient
-        return float(gradient @ solve_information(chosen.mT @ self._information @ chosen, gradient))
+    def _predicts(self, names: tuple[str, ...]) -> bool:
+        """Whether a choice, found without some frames or without some points, makes these fit better, beyond doubt."""
+        return all(_certain(torch.stack([self._gain_on(fold, names) for fold in folds])) for folds in self._folds if folds)
+
+    def _gain_on(self, fold: Fold, names: tuple[str, ...]) -> Tensor:
+        """Decrease of a fold's cost by a choice that was found without it, beyond that by the poses alone."""
+        information, gradient = self._information - fold.information, self._gradient - fold.gradient
+
+        def decrease(names: tuple[str, ...]) -> Tensor:
+            chosen, _ = self._chosen(names)
+            step = -chosen @ solve_information(chosen.mT @ information @ chosen, chosen.mT @ gradient)
+            return -step @ (2 * fold.gradient + fold.information @ step)
+
+        return decrease(names) - decrease(())
+
+    @cached_property
+    def _folds(self) -> tuple[list[Fold], list[Fold]]:
+        """Parts of the keypoints: frames one after another, and groups of points."""
+        m = self._objective.measurements
+        blocks = [frames for frames in _blocks(m.frames, _FRAME_FOLDS) if frames.stop > frames.start]
+        columns = [m.columns_of(frames) for frames in blocks]
+        of_frames = [
+            _fold(m.within(f), self._objective, replace(self._state, points=self._state.points[..., c]))
+            for f, c in zip(blocks, columns, strict=True)
+        ]
+        of_points = [_fold(m.keeping(kept), self._objective, self._state) for kept in _point_groups(self._objective)]
+        return of_frames if len(of_frames) > 1 else [], of_points if len(of_points) > 1 else []
 
     def _solved(self, names: tuple[str, ...]) -> tuple[RigUnknowns, Tensor, Tensor]:
         """A choice's unknowns, their values and their covariance."""
         chosen, unknowns = self._chosen(names)
-        information = chosen.mT @ self._information @ chosen
         poses = len(self._gradient) - self._every.count
+        information = chosen.mT @ self._information @ chosen
         values = -solve_information(information, chosen.mT @ self._gradient)[poses:]
-        return unknowns, values, covariance_of(information)[poses:, poses:] / max(self._evidence, _LEAST_EVIDENCE)
+        covariance = covariance_of(information)
+        if self._gradient_covariance is not self._information:
+            covariance = covariance @ chosen.mT @ self._gradient_covariance @ chosen @ covariance
+        return unknowns, values, covariance[poses:, poses:]
 
     def _chosen(self, names: tuple[str, ...]) -> tuple[Tensor, RigUnknowns]:
         """The map from poses and a choice's unknowns to poses and all unknowns, and the choice's unknowns."""
@@ -140,6 +184,51 @@ def _with_every_unknown(kept: Measurements, state: State, every: RigUnknowns) ->
         unknowns=every,
         motion=kept.motion._replace(reference=every.given),
     )
+
+
+def _fold(part: Measurements, objective: Objective, state: State) -> Fold:
+    """The fold of a part of the measurements, at a state of the same columns."""
+    system = NormalEquations(Objective(part, objective.losses), state, cameras_free=True)
+    information = system.reduced[0].clone()
+    _, gradient, prior = objective.linearise_prior(state)
+    unknowns = len(information) - prior.shape[1]
+    information.diagonal()[unknowns:] -= prior[0]
+    return Fold(information, system.reduced_gradient[0] - torch.nn.functional.pad(gradient[0], (unknowns, 0)))
+
+
+def _blocks(frames: int, count: int) -> list[slice]:
+    """Frames in blocks of about equal length, one after another."""
+    bounds = [frames * number // count for number in range(count + 1)]
+    return list(map(slice, bounds[:-1], bounds[1:]))
+
+
+def _point_groups(objective: Objective) -> list[Tensor]:
+    """Masks (N,) of groups of points that no loss couples: sticks, which set the scale, are never left out. Often empty."""
+    m = objective.measurements
+    coupled = {point for cluster in objective.clusters for point in cluster}
+    single = [point for point in range(m.points_per_frame) if point not in coupled]
+    if len(single) < 2 * _POINT_FOLDS:
+        return []
+    groups = m.confidence.new_zeros(_POINT_FOLDS, m.points_per_frame, dtype=torch.bool)
+    for number, group in enumerate(groups):
+        group[single[number::_POINT_FOLDS]] = True
+    return [group.repeat(m.frames) for group in groups]
+
+
+def _certain(gains: Tensor) -> bool:
+    """Whether the mean of some gains is above zero by more than its standard error."""
+    return float(gains.mean()) > float(gains.std()) / len(gains) ** 0.5
+
+
+def _unexplained_correlation(objective: Objective, state: State, sigma_px: Tensor) -> ErrorCorrelation:
+    """The correlation of the errors that no lens and no clock explains: near the least cost with all of them unknown."""
+    correlation = error_correlation(objective.measurements, state, sigma_px)
+    if not correlation.lasts:
+        return correlation
+    outcome = gauss_newton(
+        objective, state, cameras_free=True, termination=Termination(_STEPS), stage="check", listener=ignore_record
+    )
+    return error_correlation(objective.measurements, outcome.state, sigma_px)
 
 
 def _choices() -> Iterator[tuple[str, ...]]:

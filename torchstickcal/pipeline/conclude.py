@@ -7,13 +7,14 @@ from collections.abc import Mapping
 import torch
 from torch import Tensor
 
+from torchstickcal.model.correlation import error_correlation
 from torchstickcal.model.unknowns import RigEstimate, all_unknowns
 from torchstickcal.pipeline.adjust import Adjustment
 from torchstickcal.pipeline.check import CameraCheck
 from torchstickcal.pipeline.synchronise import ClockEstimate, CommonFrames
 from torchstickcal.pipeline.warnings import warnings_of
 from torchstickcal.result import Calibration, CameraParameter
-from torchstickcal.solvers.uncertainty import camera_covariance, likelihood
+from torchstickcal.solvers.uncertainty import camera_covariance, likelihood, ruler_covariance
 
 
 def conclude(
@@ -97,7 +98,10 @@ def _covariance(ended: Adjustment) -> Tensor:
         size = 6 * (measurements.num_cameras - 1) + measurements.unknowns.count
         return torch.full((size, size), torch.nan, dtype=torch.float64, device=measurements.pixels.device)
     kept = measurements.keeping(last.inliers & ended.agreeing_cameras[..., None])
-    return camera_covariance(likelihood(kept, last.losses, ended.last.sigma_px), last.state)[0]
+    sigma_px, times = ended.last.sigma_px, last.correlation_frames
+    correlation = error_correlation(kept, last.state, sigma_px)
+    noise = camera_covariance(likelihood(kept, last.losses, sigma_px * times.sqrt()), last.state, correlation, times)[0]
+    return noise + ruler_covariance(kept, last.state, sigma_px)
 
 
 def _unknowns(ended: Adjustment, check: CameraCheck, covariance: Tensor) -> dict[str, CameraParameter]:

@@ -11,6 +11,7 @@ from torch import Tensor
 
 from torchstickcal.config import Stage
 from torchstickcal.losses import Loss, LossContext, LossSettings, TrackLoss
+from torchstickcal.model.correlation import error_correlation
 from torchstickcal.model.measurements import Measurements
 from torchstickcal.model.noise import estimate_acceleration_m, estimate_sigma_px
 from torchstickcal.model.objective import Objective
@@ -25,6 +26,9 @@ _RESOLUTION = {torch.float64: 0.0, torch.float32: 1e-6}
 _LEAST_AGREEING_SHARE = 0.15
 """Share of a camera's keypoints that must agree with the other cameras. Sound cameras have more than 0.8, cameras that see
 another scene 0.3 to 0.4; by chance some always agree."""
+_CONTRAST = 1.0
+"""Variance between points, of the logarithm of the errors that last, in their weights. A stick's ends are often tracked better
+than joints, which are many: seen as one group, they would look like them."""
 
 
 class StageResult(NamedTuple):
@@ -39,6 +43,8 @@ class StageResult(NamedTuple):
     """(B, C, N), True where a keypoint took part"""
     sigma_px: Tensor
     """(B, P), noise of each point's keypoints, estimated before the stage, pixels"""
+    correlation_frames: Tensor
+    """(B, P), as many keypoints of each point counted as one, because their errors are alike"""
     records: tuple[StageRecord, ...]
     """one for each session"""
 
@@ -51,6 +57,7 @@ class StageResult(NamedTuple):
             {name: loss.replaced(where, other.losses[name]) for name, loss in self.losses.items()},
             torch.where(where[:, None, None], other.inliers, self.inliers),
             torch.where(where[:, None], other.sigma_px, self.sigma_px),
+            torch.where(where[:, None], other.correlation_frames, self.correlation_frames),
             tuple(new if taken else old for old, new, taken in zip(self.records, other.records, where.tolist(), strict=True)),
         )
 
@@ -79,7 +86,8 @@ def run_stage(
         agreeing = measurements.by_frame(squared_residuals) <= limits[:, None, None]
         measurements = measurements.keeping(agreeing.flatten(2))
     del squared_residuals
-    objective = Objective(measurements, _losses(stage, measurements, state, sigma_px))
+    losses, correlation_frames = _losses(stage, measurements, state, sigma_px)
+    objective = Objective(measurements, losses)
     outcome = solver(run.config.solver)(
         objective,
         state,
@@ -98,7 +106,8 @@ def run_stage(
     run.took(name, seconds)
     ended = zip(stops, outcome.iterations, strict=True)
     records = tuple(StageRecord(name, stop, seconds, iterations) for stop, iterations in ended)
-    return StageResult(stage, state, minimum, objective.losses, measurements.visible, sigma_px, records)
+    inliers = measurements.visible
+    return StageResult(stage, state, minimum, losses, inliers, sigma_px, correlation_frames, records)
 
 
 def agreeing_cameras(given: Measurements, kept: Measurements) -> Tensor:
@@ -123,9 +132,17 @@ def _judged(stops: Sequence[Stop], verdict: Stop, applies: Tensor) -> tuple[Stop
     return tuple(verdict if stop.converged and bad else stop for stop, bad in zip(stops, applies.tolist(), strict=True))
 
 
-def _losses(stage: Stage, measurements: Measurements, state: State, sigma_px: Tensor) -> dict[str, Loss]:
-    """The losses of a stage. Track losses come last: their sigma may be estimated with the others at hand."""
+def _losses(stage: Stage, measurements: Measurements, state: State, sigma_px: Tensor) -> tuple[dict[str, Loss], Tensor]:
+    """The losses of a stage, and how many keypoints of each point count as one in them, (B, P).
+
+    Track losses come last: their sigma may be estimated with the others at hand.
+    """
     losses: dict[str, Loss] = {}
+    times = torch.ones_like(sigma_px)
+
+    def correlation_frames(given: float | str) -> Tensor:
+        lasting = error_correlation(measurements, state, sigma_px, _CONTRAST).times if given == "estimated" else given
+        return times.copy_(torch.as_tensor(lasting))
 
     def acceleration_m() -> Tensor:
         system = NormalEquations(Objective(measurements, losses), state, cameras_free=False)
@@ -134,7 +151,8 @@ def _losses(stage: Stage, measurements: Measurements, state: State, sigma_px: Te
     def is_track(named: tuple[str, LossSettings]) -> bool:
         return issubclass(named[1].loss, TrackLoss)
 
-    context = LossContext(measurements.point_index, measurements.stick_sigma_m, sigma_px, acceleration_m)
+    given = measurements.point_index, measurements.stick_sigma_m, sigma_px
+    context = LossContext(*given, correlation_frames, acceleration_m)
     for name, settings in sorted(stage.losses.items(), key=is_track):
         losses[name] = settings.build(context)
-    return losses
+    return losses, times

@@ -1,6 +1,7 @@
 """Covariances of cameras and points.
 
-The inverse of the reduced camera system is the covariance of the cameras' tangents, including the uncertainty of the points.
+The inverse of the reduced camera system is the covariance of the cameras' tangents, including the uncertainty of the points,
+where the errors of the keypoints are independent. Errors that last for several frames add to it.
 The covariance of a point is the covariance of its triangulation plus the propagated covariance of the cameras. So no matrix
 larger than the reduced camera system is inverted.
 """
@@ -14,12 +15,14 @@ from torch import Tensor
 
 from torchstickcal.geometry import se3
 from torchstickcal.geometry.cameras import Intrinsics
-from torchstickcal.geometry.singular import covariance_of
+from torchstickcal.geometry.singular import covariance_root
 from torchstickcal.geometry.symmetric import backward, cholesky, forward
 from torchstickcal.losses import Loss, ReprojectionLoss, StickLengthLoss
+from torchstickcal.model.correlation import ErrorCorrelation
 from torchstickcal.model.measurements import Measurements
 from torchstickcal.model.objective import Objective
 from torchstickcal.model.state import State
+from torchstickcal.solvers.correlated import inflation
 from torchstickcal.solvers.elimination.cross_blocks import cross_rows
 from torchstickcal.solvers.elimination.normal_equations import NormalEquations
 
@@ -44,7 +47,9 @@ def likelihood(measurements: Measurements, losses: Mapping[str, Loss], sigma_px:
     return Objective(measurements, normal)
 
 
-def camera_covariance(objective: Objective, state: State) -> Tensor:
+def camera_covariance(
+    objective: Objective, state: State, correlation: ErrorCorrelation | None = None, times: Tensor | None = None
+) -> Tensor:
     """Covariance of the cameras, (B, 6 (C - 1) + K, 6 (C - 1) + K).
 
     Its rows are the tangents of all cameras but the first (translation in metres, rotation in radians), then the K lens and
@@ -53,8 +58,36 @@ def camera_covariance(objective: Objective, state: State) -> Tensor:
     Args:
         objective: the likelihood, from :func:`likelihood`.
         state: the solution.
+        correlation: of the keypoint errors; None where they are independent.
+        times: (B, P), as many keypoints of each point count as one in the likelihood; None for 1.
     """
-    return covariance_of(NormalEquations(objective, state, cameras_free=True).reduced)
+    root = covariance_root(NormalEquations(objective, state, cameras_free=True).reduced)
+    if correlation is None or not correlation.lasts:
+        return root @ root.mT
+    times = torch.ones_like(correlation.times) if times is None else times
+    return root @ inflation(objective, state, root, correlation, times) @ root.mT
+
+
+def ruler_covariance(measurements: Measurements, state: State, sigma_px: Tensor) -> Tensor:
+    """Covariance that errors of the sticks' given lengths add, (6 (C - 1) + K, 6 (C - 1) + K), for one session.
+
+    A length that is wrong is wrong in every frame: the whole scene has another scale. Where several sticks are given, each has
+    the share of the scale that it determines.
+
+    Args:
+        measurements: the inliers.
+        state: the solution.
+        sigma_px: noise of each point's keypoints, (B, P).
+    """
+    m = measurements
+    centres = (state.rotations[0].mT @ state.translations[0][..., None])[1:, :, 0]
+    tangents = torch.nn.functional.pad(centres, (0, 3)).flatten()
+    direction = torch.nn.functional.pad(tangents, (0, m.unknowns.count))
+    noise = m.by_frame(point_variances(m, state, sigma_px))[0][:, m.sticks].sum(-1)
+    tolerance, lengths = m.stick_sigma_m, m.lengths_m[0]
+    information = (lengths.square() / (tolerance.square() + noise)).where(m.stick_active[0], 0.0).sum(0)
+    share = information / information.sum().clamp_min(1e-300)
+    return (share * tolerance / lengths).square().sum() * torch.outer(direction, direction)
 
 
 def point_variances(measurements: Measurements, state: State, sigma_px: Tensor) -> Tensor:

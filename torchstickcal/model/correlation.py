@@ -1,0 +1,202 @@
+"""How long the errors of the keypoints last: their autocorrelation over frames, for each point.
+
+Detectors err alike in neighbouring frames, so that n keypoints of a track have less information than n independent ones. The
+autocorrelation is estimated from the residuals, pooled over cameras and image axes. Lags are pooled too, in bins that become
+wider with the lag, so that a small correlation that lasts long is found. Only what chance does not explain is kept: where
+errors are independent, the estimate is zero at every lag, exactly.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from torchstickcal.model.measurements import Measurements
+from torchstickcal.model.shrinkage import shrunk_logarithms
+from torchstickcal.model.state import State
+
+_CUT = 3.0
+"""Residual, in standard deviations, to which larger ones are drawn in: a single outlier must not look like a pattern."""
+_SIGNIFICANT = 3.0
+"""Estimate, in standard deviations, from which on a correlation of all points together is taken as real; of one point, 2."""
+_SIGNIFICANT_OF_POINT = 2.0
+_BIN_SHARE = 0.25
+"""Width of a bin of lags, as a share of the lag."""
+_LEAST_PAIRS = 30
+"""Pairs of residuals from which on a bin is estimated by itself. Beyond, the correlation is taken to stay as it is."""
+_LEAST_VARIANCE = 0.05
+"""Squared residual, in units of the noise, below which residuals are rounding errors."""
+_LARGEST_AMPLITUDE = 10.0
+_FARTHEST = 1.0
+_MEAN_BY_CHANCE = 0.8
+"""Mean of a positive quantity of which zero was found, in standard deviations of the estimate."""
+_VALUES_AT_ONCE = 2**22
+
+
+@dataclass(frozen=True)
+class ErrorCorrelation:
+    """Autocorrelation of the keypoint errors along each point's track, by lag.
+
+    Args:
+        values: (B, P, F), the correlation of errors that are 0, 1, ... F - 1 frames apart, 0 to 1; 1 at lag 0.
+    """
+
+    values: Tensor
+
+    @property
+    def lasts(self) -> bool:
+        """Whether the errors of any point last longer than one frame."""
+        return bool(self.values[..., 1:].any())
+
+    @property
+    def times(self) -> Tensor:
+        """Integrated autocorrelation time of each point, (B, P), frames: as many keypoints are worth one independent one.
+
+        1 where errors are independent, F where they never change. A lag l is found F - l times in F frames.
+        """
+        frames = self.values.shape[-1]
+        found = 1 - torch.arange(1, frames).to(self.values) / frames
+        return 1 + 2 * self.values[..., 1:] @ found
+
+    def spectrum(self, frames: int) -> Tensor:
+        """Power of the errors at the frequencies of ``rfft`` over 2 ``frames`` frames, (B, P, frames + 1), mean 1."""
+        lags = self.values[..., :frames]
+        around = torch.cat([lags, lags[..., -1:], lags[..., 1:].flip(-1)], dim=-1)
+        power = torch.fft.rfft(around).real.clamp_min(0.0)
+        return power / ((2 * power.sum(-1) - power[..., 0] - power[..., -1]) / (2 * frames))[..., None]
+
+    def between(self, first: slice, second: slice) -> Tensor:
+        """Mean correlation (B, P) of the errors in a frame of one slice with those in a frame of a later slice."""
+        gap = second.start - first.start
+        lags = torch.arange(gap - (first.stop - first.start) + 1, gap + (second.stop - second.start))
+        pairs = torch.minimum(lags - lags[0] + 1, lags[-1] + 1 - lags)
+        pairs = pairs.clamp_max(min(first.stop - first.start, second.stop - second.start)).to(self.values)
+        return self.values[..., lags] @ pairs / pairs.sum()
+
+
+def error_correlation(measurements: Measurements, state: State, sigma_px: Tensor, contrast: float = 0.0) -> ErrorCorrelation:
+    """The autocorrelation of the keypoint errors, from the residuals.
+
+    The estimates of different points are shrunk towards their common mean (empirical Bayes), as those of the noise are.
+
+    Args:
+        measurements: the inliers.
+        state: the solution.
+        sigma_px: noise of each point's keypoints, (B, P), pixels.
+        contrast: variance of the logarithm of what lasts between points that is taken for granted; with more, points are drawn
+            less towards the mean.
+    """
+    m = measurements
+    values = torch.zeros(m.sessions, m.points_per_frame, m.frames, dtype=torch.float64, device=m.pixels.device)
+    values[..., 0] = 1.0
+    if m.frames > 2:
+        bins = _bins(m.frames, values.device)
+        products, pairs = _binned_products(m, _residual_tracks(m, state, sigma_px), bins)
+        free = _freedom_share(m)
+        products, pairs = free[..., None] * products, free[..., None] * pairs
+        common, time = _pooled(products.sum(1), pairs.sum(1), bins.bincount())
+        if bool(common.any()):
+            independent = 2 * free * m.by_frame(m.visible.sum(1)).sum(1) / time.clamp_max(m.frames)
+            amplitudes = _amplitudes(products, pairs, common, independent, contrast)
+            values[..., 1:] = (amplitudes[..., None] * common[:, None]).clamp(0.0, 1.0)[..., bins]
+    return ErrorCorrelation(values)
+
+
+def _bins(frames: int, device: torch.device) -> Tensor:
+    """The bin of each lag 1, 2, ... ``frames`` - 1."""
+    bins: list[int] = []
+    while len(bins) < frames - 1:
+        bins += [bins[-1] + 1 if bins else 0] * max(1, int(_BIN_SHARE * (len(bins) + 1)))
+    return torch.tensor(bins[: frames - 1], device=device)
+
+
+def _residual_tracks(m: Measurements, state: State, sigma_px: Tensor) -> Tensor:
+    """Whitened residuals by track, (B, P, C, 2, F), in float32; zero where not seen."""
+    tracks = sigma_px.new_empty(m.sessions, m.points_per_frame, m.num_cameras, 2, m.frames, dtype=torch.float32)
+    for columns, residuals, _ in m.residuals(state):
+        weights = m.confidence[..., columns].sqrt().unflatten(-1, (-1, m.points_per_frame)) / sigma_px[:, None, None]
+        whitened = residuals.unflatten(-1, (-1, m.points_per_frame)) * weights.unsqueeze(2)
+        whitened = whitened.where(weights.unsqueeze(2) > 0, 0.0).clamp(-_CUT, _CUT)
+        frames = slice(columns.start // m.points_per_frame, columns.stop // m.points_per_frame)
+        tracks[..., frames] = whitened.movedim(-1, 1).to(torch.float32)
+    return tracks
+
+
+def _binned_products(m: Measurements, tracks: Tensor, bins: Tensor) -> tuple[Tensor, Tensor]:
+    """Products of a track's residuals at some lag, in units of their variance, and how many pairs there are, (B, P, bins)."""
+    seen = m.by_frame(m.visible).permute(0, 3, 1, 2)
+    together = max(1, _VALUES_AT_ONCE // (2 * m.sessions * m.num_cameras * 2 * m.frames))
+    products, pairs = (tracks.new_zeros(*tracks.shape[:2], int(bins[-1]) + 1, dtype=torch.float64) for _ in range(2))
+    for first in range(0, m.points_per_frame, together):
+        part = slice(first, first + together)
+        own, count = _by_lag(tracks[:, part].flatten(2, 3)), 2 * _by_lag(seen[:, part].to(tracks.dtype)).round()
+        variance = (own[..., :1] / count[..., :1].clamp_min(1)).clamp_min(_LEAST_VARIANCE)
+        products[:, part].index_add_(-1, bins, own[..., 1:] / variance)
+        pairs[:, part].index_add_(-1, bins, count[..., 1:])
+    return products, pairs
+
+
+def _by_lag(series: Tensor) -> Tensor:
+    """Sums over tracks (B, P, tracks, F) of the products of values some lag apart, (B, P, F)."""
+    frames = series.shape[-1]
+    power = torch.view_as_real(torch.fft.rfft(series, n=2 * frames)).square().sum((-3, -1), dtype=torch.float64)
+    return torch.fft.irfft(power, n=2 * frames)[..., :frames]
+
+
+def _freedom_share(m: Measurements) -> Tensor:
+    """Degrees of freedom that the residuals of each point have left when it is fitted, as a share of their number, (B, P)."""
+    views = m.visible.sum(1)
+    free = m.by_frame((2 * views - 3).clamp_min(0)).sum(1)
+    return free / m.by_frame(2 * views).sum(1).clamp_min(1)
+
+
+def _pooled(products: Tensor, pairs: Tensor, widths: Tensor) -> tuple[Tensor, Tensor]:
+    """The correlation of all points together by bin that chance does not explain, (B, bins), and its integrated time (B, 1).
+
+    The sampling variance of a bin is one over its pairs where errors are independent. Where they last, the products at
+    neighbouring lags are alike too (Bartlett's formula), by what was found at smaller lags.
+
+    Args:
+        products: sums of the products of residuals, (B, bins).
+        pairs: their numbers, as far as they are independent, (B, bins).
+        widths: (bins,), numbers of lags.
+    """
+    values = torch.zeros_like(products)
+    time, squares = (torch.ones_like(products[:, :1]) for _ in range(2))
+    for number, width in enumerate(widths.tolist()):
+        one = slice(number, number + 1)
+        variance = torch.minimum(time.square(), width * squares) / pairs[:, one].clamp_min(0.1)
+        found = products[:, one] / pairs[:, one].clamp_min(0.1)
+        found = found.where(found > _SIGNIFICANT * variance.sqrt(), 0.0).clamp(0.0, 1.0)
+        if number:
+            found = found.where(pairs[:, one] >= _LEAST_PAIRS, values[:, number - 1 : number])
+        values[:, one] = found
+        time, squares = time + 2 * width * found, squares + 2 * width * found.square()
+    return values, time
+
+
+def _amplitudes(products: Tensor, pairs: Tensor, common: Tensor, independent: Tensor, contrast: float) -> Tensor:
+    """How much of the common correlation (B, bins) each point has, (B, P), drawn towards that of all points.
+
+    It is a variance, that of the errors that last, estimated from few independent ones. So its logarithm is drawn towards the
+    mean, as that of the noise is. A point that has none where others clearly have some gets
+    what can have been missed by chance.
+
+    Args:
+        products: sums of the products of residuals, (B, P, bins).
+        pairs: their numbers, as far as they are independent, (B, P, bins).
+        common: the correlation of all points together.
+        independent: (B, P), number of independent errors that each point has had.
+        contrast: variance of the logarithms between points that is taken for granted.
+    """
+    by_chance = (pairs @ common.square()[..., None])[..., 0].clamp_min(1e-12).reciprocal()
+    own = (products @ common[..., None])[..., 0] * by_chance
+    least = _SIGNIFICANT_OF_POINT * by_chance.sqrt()
+    scatter = 2 / independent.clamp_min(0.1)
+    nothing = (own < least) & (least < (-_SIGNIFICANT_OF_POINT * scatter.sqrt()).exp())
+    own = torch.maximum(own, least).clamp_max(_LARGEST_AMPLITUDE)
+    sampling = by_chance / own.square() + scatter
+    drawn = shrunk_logarithms(own.log(), sampling, independent > 0, contrast, _FARTHEST).exp()
+    return drawn.where(~nothing, _MEAN_BY_CHANCE * by_chance.sqrt())
