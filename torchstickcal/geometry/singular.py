@@ -54,8 +54,8 @@ def covariance_root(information: Tensor) -> Tensor:
     """
     values, vectors, determined = _directions(information)
     variances = torch.where(determined, values, _SINGULAR * values[..., -1:].clamp_min(1e-300)).reciprocal()
-    root = vectors * variances.sqrt()[..., None, :]
     nothing = ~vectors.any(-1)
+    root = (vectors * variances.sqrt()[..., None, :]).masked_fill(nothing[..., None], 0.0)
     return root + (nothing * _UNKNOWN_VARIANCE**0.5).diag_embed().to(root)
 
 
