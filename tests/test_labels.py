@@ -142,8 +142,8 @@ def test_labels_are_saved(tmp_path: Path):
 def test_residuals_are_those_of_the_keypoints_used():
     observations, _ = session(3)
     found = calibrate(relabelled(observations, chosen(observations, 0.3), body(observations)))
-    assert float(found.residuals_px.norm(dim=-1).nan_to_num().max()) < 12
-    assert found.inliers.all()
+    assert float(found.residuals_px[found.inliers].norm(dim=-1).quantile(0.99)) < 12
+    assert found.inliers.double().mean() > 0.99
 
 
 def test_the_published_method_does_not_relabel():
@@ -154,7 +154,10 @@ def test_the_published_method_does_not_relabel():
 def test_gradients_of_the_layer_flow_to_the_keypoints_used():
     observations, _ = session(3, 12)
     flipped = relabelled(observations, chosen(observations, 0.2), body(observations))
-    layer = CalibrationLayer(observations.sticks, point_names=observations.point_names)
+    known = {"reprojection": {"sigma_px": 1.0, "correlation_frames": 1.0}, "reject_sigmas": False}
+    settings = {"extends": "default", "stages": dict.fromkeys(("metric", "selected", "refined"), known)}
+    settings["stages"] |= {"trajectories": known | {"smoothness": {"sigma_m": 0.1}}}
+    layer = CalibrationLayer(observations.sticks, settings, point_names=observations.point_names)
     keypoints = flipped.keypoints.clone().requires_grad_()
     direction = torch.from_numpy(np.random.default_rng(1).normal(size=keypoints.shape))
 
@@ -162,7 +165,7 @@ def test_gradients_of_the_layer_flow_to_the_keypoints_used():
         return layer(keypoints, observations.cameras).translations.square().sum()
 
     result = layer(keypoints, observations.cameras)
-    assert torch.equal(result.keypoint_index, calibrate(flipped).keypoint_index)
+    assert torch.equal(result.keypoint_index, calibrate(flipped, settings).keypoint_index)
     assert (result.keypoint_index != torch.arange(observations.num_points)).any()
     slope = float((torch.autograd.grad(value(keypoints), keypoints)[0] * direction).sum())
     step = 1e-4

@@ -45,9 +45,10 @@ def test_both_solvers_agree(sequences: tuple[Source, ...], config: str):
         case = source.load()
         assert case is not None
         observations = case.observations
-        ours, theirs = calibrate(observations, config), calibrate(observations, {"extends": config, "solver": "lbfgs"})
+        settings = {"extends": config, "stages": {name: {"reject_sigmas": False} for name in load_config(config).stages}}
+        ours, theirs = calibrate(observations, settings), calibrate(observations, settings | {"solver": "lbfgs"})
         cost, other = (calibration.stages[-1].iterations[-1].cost for calibration in (ours, theirs))
-        assert cost == pytest.approx(other, rel=1e-6)
+        assert cost == pytest.approx(other, rel=1e-5)  # several times the tolerance of the last stage
 
 
 def test_wand(data: Path):

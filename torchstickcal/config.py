@@ -132,9 +132,9 @@ class Config:
     Example:
         >>> config = load_config({"extends": "default", "stages": {"metric": {"stick_length": {"sigma_m": 0.003}}}})
         >>> list(config.stages)
-        ['unscaled', 'metric', 'refined', 'trajectories']
+        ['unscaled', 'metric', 'selected', 'refined', 'trajectories']
         >>> config.stages["metric"].losses["stick_length"]
-        StickLengthSettings(sigma_m=0.003, weight=1.0)
+        StickLengthSettings(sigma_m=0.003, kernel='cauchy', kernel_scale=3.0, weight=1.0)
     """
 
     stages: dict[str, Stage]

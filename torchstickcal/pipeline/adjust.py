@@ -320,13 +320,15 @@ def _through(stages: Iterable[tuple[str, Stage]], adjustment: Adjustment, run: R
     Errors that last are hidden in the cameras, as long as points with such errors determine them.
     """
     for name, stage in stages:
-        before = torch.ones_like(adjustment.state.points[:, 0, :1])
-        for _ in range(_MOST_ROUNDS):
-            adjustment = adjustment.ended(run_stage(name, stage, adjustment.measurements, adjustment.state, run))
-            times = adjustment.last.correlation_frames
-            if bool(((times / before).log().abs() < _SETTLED).all()):
+        adjustment = adjustment.ended(run_stage(name, stage, adjustment.measurements, adjustment.state, run))
+        before, times = torch.ones_like(adjustment.last.correlation_frames), adjustment.last.correlation_frames
+        for _ in range(_MOST_ROUNDS - 1):
+            settled = ((times / before).log().abs() < _SETTLED).flatten(1).all(1)
+            if bool(settled.all()):
                 break
-            before = times
+            again = adjustment.ended(run_stage(name, stage, adjustment.measurements, adjustment.state, run))
+            adjustment = again.replaced(settled, adjustment)
+            before, times = times, adjustment.last.correlation_frames
     return adjustment
 
 

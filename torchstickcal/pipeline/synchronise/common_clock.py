@@ -11,7 +11,7 @@ from torchstickcal.model.measurements import Measurements
 from torchstickcal.model.state import State
 from torchstickcal.pipeline.stage import StageResult
 from torchstickcal.pipeline.synchronise.exposure import Exposures, Support
-from torchstickcal.solvers import StageRecord
+from torchstickcal.solvers import StageRecord, Stop
 
 CLOCK_STAGE = "clocks"
 """Name of the repeated stage in the records."""
@@ -30,7 +30,7 @@ def synchronise_keypoints(
 ) -> tuple[Measurements, StageResult, list[list[StageRecord]]]:
     """Move the keypoints to the common frames and run a stage with them, until the keypoints no longer move.
 
-    A session whose stage does not converge twice in a row is left as it is.
+    A session whose stage stops at its limit of iterations twice in a row is left as it is.
 
     Args:
         detected: the keypoints as detected.
@@ -58,7 +58,7 @@ def synchronise_keypoints(
         for session, record, continued in zip(records, repeated.records, unfinished.tolist(), strict=True):
             session.extend([record] if continued else [])
         result = result.replaced(unfinished, repeated)
-        stopped = torch.tensor([not record.stop.converged for record in repeated.records], device=unfinished.device)
+        stopped = torch.tensor([record.stop is Stop.ITERATIONS for record in repeated.records], device=unfinished.device)
         unfinished, at_limit = unfinished & ~(stopped & at_limit), stopped
         support = support.replaced(unfinished, _support(moved, result))
     return measurements, result, records
