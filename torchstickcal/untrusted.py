@@ -2,16 +2,22 @@
 
 from __future__ import annotations
 
+import csv
+import io
+import json
 import math
 import os
+import re
 import stat
 import zipfile
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, BinaryIO
+from xml.etree import ElementTree
 
 import numpy as np
+import yaml
 from numpy.typing import NDArray
 
 from torchstickcal.errors import CalibrationError, FileFormatError
@@ -23,6 +29,9 @@ below."""
 SLACK_BYTES = 16 * 2**20
 """What a file of any size may need in addition."""
 LONGEST_TOML_BYTES = 16 * 2**20
+LONGEST_YAML_BYTES = LONGEST_XML_BYTES = 4 * 2**20
+_YAML_HEADER = re.compile(r"\A%YAML[^\n]*\n")
+"""The first line of OpenCV's files, which other readers of YAML refuse."""
 _LONGEST_CAUSE = 300
 """Characters of a foreign message that an error shows."""
 _MOST_EMPTY_ROWS = 10_000
@@ -116,6 +125,75 @@ def read_toml(path: str | Path) -> dict[str, Any]:
         if len(content) > LONGEST_TOML_BYTES:
             raise ValueError(f"more than {LONGEST_TOML_BYTES} bytes")
         return parse_toml(content)
+
+
+def read_text(path: str | Path, longest_bytes: int | None = None) -> str:
+    """A text in UTF-8, with or without a byte order mark; errors as of :func:`read_toml`."""
+    with reading(path, "a text in UTF-8"), open_regular(path) as file:
+        content = file.read() if longest_bytes is None else file.read(longest_bytes + 1)
+        if longest_bytes is not None and len(content) > longest_bytes:
+            raise ValueError(f"more than {longest_bytes} bytes")
+        return content.decode("utf-8-sig")
+
+
+def read_json(path: str | Path) -> Any:
+    """The content of a JSON file; errors as of :func:`read_toml`."""
+    text = read_text(path)
+    with reading(path, "a JSON file"):
+        return json.loads(text)
+
+
+def read_yaml(path: str | Path) -> Any:
+    """The content of a YAML file of at most :data:`LONGEST_YAML_BYTES`, also of OpenCV's; errors as of :func:`read_toml`.
+
+    What a tag such as ``!!opencv-matrix`` stands before is read as if it had none.
+    """
+    text = read_text(path, LONGEST_YAML_BYTES)
+    with reading(path, "a YAML file"):
+        return yaml.load(_YAML_HEADER.sub("", text), _PlainLoader)
+
+
+def read_xml(path: str | Path) -> ElementTree.Element:
+    """The root of an XML file of at most :data:`LONGEST_XML_BYTES` without entities; errors as of :func:`read_toml`."""
+    text = read_text(path, LONGEST_XML_BYTES)
+    with reading(path, "an XML file without a document type"):
+        if "<!DOCTYPE" in text or "<!ENTITY" in text:
+            raise ValueError("a document type, which may let the file grow without bounds")
+        return ElementTree.fromstring(text.encode())
+
+
+def read_rows(path: str | Path) -> list[list[str]]:
+    """The rows of a CSV file, separated by commas, semicolons or tabs, without empty ones; errors as of :func:`read_toml`."""
+    text = read_text(path)
+    with reading(path, "a table (.csv)"):
+        first, _, _ = text.partition("\n")
+        delimiter = max(",;\t", key=first.count)
+        return [row for row in csv.reader(io.StringIO(text, newline=""), delimiter=delimiter, strict=True) if any(row)]
+
+
+def read_array(path: str | Path) -> NDArray[Any]:
+    """The array of an ``.npy`` file; errors as of :func:`read_toml`."""
+    with reading(path, "an array of numbers or texts (.npy)"), open_regular(path) as file:
+        _check_header("of the file", file, os.fstat(file.fileno()).st_size)
+        file.seek(0)
+        array = np.lib.format.read_array(file, allow_pickle=False)
+        return array.astype(array.dtype.newbyteorder("="), copy=False)
+
+
+class _PlainLoader(yaml.SafeLoader):
+    """YAML as lists, dictionaries, numbers and texts, whatever tags it has."""
+
+
+def _untagged(loader: _PlainLoader, _: str, node: yaml.Node) -> Any:
+    if isinstance(node, yaml.MappingNode):
+        return loader.construct_mapping(node, deep=True)
+    if isinstance(node, yaml.SequenceNode):
+        return loader.construct_sequence(node, deep=True)
+    assert isinstance(node, yaml.ScalarNode)
+    return loader.construct_scalar(node)
+
+
+_PlainLoader.add_multi_constructor("tag:yaml.org,2002:opencv-", _untagged)
 
 
 @contextmanager
