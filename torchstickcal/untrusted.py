@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import importlib.util
 import io
 import json
 import math
@@ -178,6 +179,103 @@ def read_array(path: str | Path) -> NDArray[Any]:
         file.seek(0)
         array = np.lib.format.read_array(file, allow_pickle=False)
         return array.astype(array.dtype.newbyteorder("="), copy=False)
+
+
+@contextmanager
+def open_h5(path: str | Path) -> Iterator[H5File]:
+    """An HDF5 file. Use it within :func:`reading`: looking up a part of a damaged file raises anything.
+
+    Raises:
+        FileFormatError: if h5py is not installed.
+        FileNotFoundError: if there is no such file.
+    """
+    try:
+        import h5py
+    except ImportError as error:
+        raise FileFormatError(
+            "a file needs a package that is not installed",
+            where=str(path),
+            got="an HDF5 file (.h5), and no package h5py",
+            expected="the package h5py",
+            remedy="Install it with `pip install h5py`, or save the file as .csv.",
+        ) from error
+    with open_regular(path) as file, h5py.File(file, "r") as content:
+        yield H5File(content, GROWTH * os.fstat(file.fileno()).st_size + SLACK_BYTES)
+
+
+def h5_can_be_read() -> bool:
+    """Whether h5py, which reads HDF5 files, is installed."""
+    return importlib.util.find_spec("h5py") is not None
+
+
+class H5File:
+    """The datasets and attributes of an HDF5 file, read when they are asked for.
+
+    Datasets that are in another file, or in several, are not read. All together may have :data:`GROWTH` times the size of the
+    file and :data:`SLACK_BYTES`.
+    """
+
+    def __init__(self, content: Any, budget_bytes: int) -> None:
+        self._content = content
+        self._left_bytes = budget_bytes
+
+    def __contains__(self, name: str) -> bool:
+        return self._found(name) is not None
+
+    def groups(self) -> list[str]:
+        """The names of what stands at the top of the file."""
+        return list(self._content)
+
+    def array(self, name: str) -> NDArray[Any]:
+        """A dataset of numbers, texts or records of these.
+
+        Raises:
+            KeyError: if there is none of this name in the file itself.
+            ValueError: if it holds something else, or is too large.
+        """
+        dataset = self._found(name)
+        if dataset is None or not hasattr(dataset, "dtype"):
+            raise KeyError(name)
+        if dataset.external or dataset.is_virtual:
+            raise ValueError(f"dataset {name!r} is in another file")
+        import h5py
+
+        text = h5py.check_string_dtype(dataset.dtype) is not None
+        kinds = {dataset.dtype[field].base.kind for field in dataset.dtype.names or ()} or {dataset.dtype.kind}
+        if not (text or kinds <= {*_KINDS, "S"}):
+            raise ValueError(f"dataset {name!r} is of the type {dataset.dtype}, not of numbers or texts")
+        self._left_bytes -= dataset.size * dataset.dtype.itemsize
+        if self._left_bytes < 0:
+            raise ValueError(f"dataset {name!r} of the shape {dataset.shape}: more than {GROWTH} times the size of the file")
+        return dataset[()]
+
+    def texts(self, name: str) -> list[str]:
+        """A dataset of texts; errors as of :meth:`array`."""
+        return [
+            value.decode() if isinstance(value, bytes) else str(value) for value in np.atleast_1d(self.array(name)).tolist()
+        ]
+
+    def attribute(self, name: str, key: str) -> Any:
+        """An attribute of a dataset or a group.
+
+        Raises:
+            KeyError: if there is none.
+        """
+        owner = self._found(name)
+        if owner is None:
+            raise KeyError(name)
+        return owner.attrs[key]
+
+    def _found(self, name: str) -> Any:
+        """What has a path of names, if it and all above it are in this file."""
+        import h5py
+
+        owner = self._content
+        for part in name.split("/"):
+            if not isinstance(owner, h5py.Group) or not isinstance(owner.get(part, getlink=True), h5py.HardLink):
+                return None
+            owner = owner[part]
+        return owner
 
 
 class _PlainLoader(yaml.SafeLoader):

@@ -72,24 +72,25 @@ def complete(recording: Recording, given: Given) -> tuple[Observations, tuple[st
         CalibrationError: if something is not known, or does not fit together.
     """
     notes = list(recording.notes)
-    names, sentences = _named(recording, given.skeleton)
-    notes += sentences
     lenses, sentences = _lenses(recording, given)
     notes += sentences
+    recording = _in_pixels(recording, lenses.image_size)
+    names, sentences = _named(recording, given.skeleton)
+    notes += sentences
     views = recording.views
-    stick_views = None if given.stick_points is None else _matching(given.stick_points, recording)
-    if given.stick_points is not None:
-        notes += given.stick_points.notes
+    stick = None if given.stick_points is None else _in_pixels(given.stick_points, lenses.image_size)
+    stick_views = None if stick is None else _matching(stick, recording)
     numbers, shifts, sentences = _frame_numbers(recording.views)
     notes += sentences
     cameras = None if lenses.intrinsics is None else Intrinsics(lenses.intrinsics, lenses.distortion, lenses.fisheye)
     athlete = athlete_of(views, shifts, given.person, names, cameras, lenses.image_size, stick_views)
     notes += athlete.notes
     keypoints = _by_frame(athlete, views, shifts, numbers)
-    if given.stick_points is not None and stick_views is not None:
-        stick = athlete_of(stick_views, shifts, AUTOMATIC, None, cameras, lenses.image_size, None)
-        keypoints = np.concatenate([keypoints, _by_frame(stick, stick_views, shifts, numbers)], axis=2)
-        names = (*names, *_named(given.stick_points, None, "stick point")[0])
+    if stick is not None and stick_views is not None:
+        held = athlete_of(stick_views, shifts, AUTOMATIC, None, cameras, lenses.image_size, None)
+        keypoints = np.concatenate([keypoints, _by_frame(held, stick_views, shifts, numbers)], axis=2)
+        names = (*names, *(stick.point_names or (f"stick {number}" for number in range(stick.num_points))))
+        notes += stick.notes
     keypoints, sentences = _scored(keypoints)
     lenses.check_inside(keypoints)
     observations = Observations(
@@ -141,7 +142,30 @@ def amended(observations: Observations, given: Given) -> tuple[Observations, tup
     return (replace(observations, **changes) if changes else observations), notes
 
 
-def _named(recording: Recording, given: str | None, other: str = "point") -> tuple[tuple[str, ...], list[str]]:
+def _in_pixels(recording: Recording, image_size: Tensor | None) -> Recording:
+    """A recording whose keypoints are all in pixels.
+
+    Raises:
+        CalibrationError: if some are shares of images whose size is not known.
+    """
+    if not any(view.normalised for view in recording.views):
+        return recording
+    if image_size is None or len(image_size) != len(recording.views):
+        raise CalibrationError(
+            "keypoints are shares of the image, whose size is not known",
+            where="image_size",
+            got="none",
+            expected="width and height in pixels",
+            remedy="Give it with --image-size WIDTH HEIGHT.",
+        )
+    views = [
+        replace(view, keypoints=view.keypoints * [*size, 1.0], normalised=False) if view.normalised else view
+        for view, size in zip(recording.views, image_size.tolist(), strict=True)
+    ]
+    return replace(recording, views=tuple(views))
+
+
+def _named(recording: Recording, given: str | None) -> tuple[tuple[str, ...], list[str]]:
     """The names of the points, and a sentence where they were not given."""
     count = recording.num_points
     if given is not None:
@@ -157,7 +181,7 @@ def _named(recording: Recording, given: str | None, other: str = "point") -> tup
         return skeleton(known[0]), [
             f"The skeleton is taken to be {known[0]}, by its {count} points; --skeleton chooses another."
         ]
-    return tuple(f"{other} {number}" for number in range(count)), []
+    return tuple(f"point {number}" for number in range(count)), []
 
 
 def _either_25(views: Sequence[View]) -> str:

@@ -49,6 +49,8 @@ class View:
     """P names, if the file has them"""
     image_size: tuple[float, float] | None = None
     """width and height in pixels, if the file has them"""
+    normalised: bool = False
+    """whether x and y are shares of the width and the height instead of pixels"""
 
     @classmethod
     def of(
@@ -94,17 +96,24 @@ class View:
         tracks: NDArray[Any],
         point_names: Sequence[str] | None = None,
         image_size: tuple[float, float] | None = None,
-        first_frame: int = 0,
+        frames: Sequence[int] | None = None,
     ) -> View:
         """The view of a camera, from tracks of people (people, F, P, 2 or 3), without frames in which a person has no point.
+
+        ``frames`` are the numbers of the F frames; None for 0, 1, 2, ...
 
         Raises:
             ValueError: if no point was ever seen.
         """
         tracks = np.asarray(tracks, dtype=np.float64)
         seen = np.isfinite(tracks[..., :2]).all(-1).any(-1)
+        numbers = range(tracks.shape[1]) if frames is None else frames
+        if len(set(numbers)) != tracks.shape[1]:
+            raise ValueError(f"{tracks.shape[1]} frames with {len(set(numbers))} different numbers")
+        several = len(tracks) > 1
         found = (
-            Detection(first_frame + int(frame), tracks[person, frame], int(person)) for frame, person in np.argwhere(seen.T)
+            Detection(int(numbers[frame]), tracks[person, frame], int(person) if several else -1)
+            for frame, person in np.argwhere(seen.T)
         )
         return cls.of(name, found, point_names, image_size)
 
@@ -131,8 +140,10 @@ class Recording:
         Points are matched by name where the files name them; a point that a camera lacks was not seen by it.
 
         Raises:
-            ValueError: if two cameras have one name, or different numbers of points without names.
+            ValueError: if there is no camera, if two have one name, or different numbers of points without names.
         """
+        if not views:
+            raise ValueError("no camera")
         views = sorted(views, key=lambda view: natural_order(view.name))
         labels = [view.name for view in views]
         if repeated := sorted({label for label in labels if labels.count(label) > 1}):
