@@ -76,7 +76,8 @@ def matrix_of(value: Any) -> NDArray[np.float64]:
         [[0.5, 2.0]]
     """
     if isinstance(value, Mapping):
-        return np.array(value["data"], dtype=np.float64).reshape(int(value["rows"]), int(value["cols"]))
+        sizes = value["sizes"] if "sizes" in value else (value["rows"], value["cols"])
+        return np.array(value["data"], dtype=np.float64).reshape(np.array(sizes, dtype=int))
     if not isinstance(value, Sequence) or isinstance(value, str):
         raise TypeError(f"a {type(value).__name__} where a matrix is expected")
     return np.array(value, dtype=np.float64)
@@ -113,13 +114,13 @@ def _camera(path: Path) -> RigCamera:
 
 def _of_xml(root: Element) -> dict[str, Any]:
     """The values of a FileStorage in XML."""
+    return {child.tag: (child.text or "").strip() if child.find("data") is None else _matrix_of_xml(child) for child in root}
+
+
+def _matrix_of_xml(element: Element) -> dict[str, Any]:
+    numbers = {part.tag: (part.text or "").split() for part in element}
+    shape = {key: [int(word) for word in numbers[key]] for key in ("sizes", "rows", "cols") if key in numbers}
     return {
-        child.tag: (child.text or "").strip()
-        if child.find("data") is None
-        else {
-            "rows": child.findtext("rows", ""),
-            "cols": child.findtext("cols", ""),
-            "data": [float(word) for word in child.findtext("data", "").split()],
-        }
-        for child in root
+        "sizes": shape.get("sizes") or [*shape["rows"], *shape["cols"]],
+        "data": [float(word) for word in numbers["data"]],
     }
