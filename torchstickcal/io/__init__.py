@@ -25,7 +25,8 @@ from torchstickcal.io.formats import (
     session_reader,
     write_calibration,
 )
-from torchstickcal.io.given import Given
+from torchstickcal.io.given import Given, complete
+from torchstickcal.io.movement import recording_of_movement
 from torchstickcal.io.npz import read_npz, write_npz
 from torchstickcal.io.recording import Detection, Recording, View
 from torchstickcal.io.rig import Rig, RigCamera
@@ -55,6 +56,7 @@ __all__ = [
     "calibration_reader",
     "calibration_writer",
     "camera_reader",
+    "complete",
     "find_reader",
     "keypoint_reader",
     "load_session",
@@ -65,6 +67,7 @@ __all__ = [
     "read_session",
     "read_sports_stick_syn",
     "reading",
+    "recording_of_movement",
     "session_reader",
     "write_calibration",
     "write_camera_toml",

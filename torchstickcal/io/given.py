@@ -70,6 +70,15 @@ def complete(recording: Recording, given: Given) -> tuple[Observations, tuple[st
 
     Raises:
         CalibrationError: if something is not known, or does not fit together.
+
+    Example:
+        >>> import numpy as np
+        >>> from torchstickcal import Stick
+        >>> from torchstickcal.io import Given, Recording, View, complete
+        >>> views = [View.of_tracks(name, np.full((1, 5, 2, 2), 100.0), ["knob", "barrel"]) for name in ("left", "right")]
+        >>> observations, notes = complete(Recording.of(views), Given(Stick("knob", "barrel", 0.864), image_size=(640, 480)))
+        >>> observations.keypoints.shape, observations.camera_names
+        (torch.Size([2, 5, 2, 2]), ('left', 'right'))
     """
     notes = list(recording.notes)
     lenses, sentences = _lenses(recording, given)

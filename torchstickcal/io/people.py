@@ -43,6 +43,8 @@ _CONTINUITY = 4.0
 """How much it counts, in frames of agreement between two cameras, that one tracklet begins where another ended."""
 _REACH = 0.25
 """How far from the stick its holder's hands are, in lengths of the holder's diagonal."""
+_AGREEING = 0.7
+"""Least share of the frames in which cameras agree on the athlete, for the choice to be sure."""
 _CLEAR = 0.15
 """Least lead of the athlete over the next person, as a share of the athlete's measure."""
 
@@ -105,22 +107,21 @@ def athlete_of(
         for person in people.rows
     ]  # fmt: skip
     order = sorted(range(len(scores)), key=lambda index: (-scores[index], index))
-    chosen = people.rows[order[0]]
-    lead = 1.0 if len(order) < 2 or scores[order[0]] <= 0 else 1 - scores[order[1]] / scores[order[0]]
-    return Athlete(chosen, _said(views, people, order, how, lead))
+    chosen, compared = people.completed(order)
+    sure = compared and scores[order[0]] > 0
+    lead = 1 - (scores[order[1]] / scores[order[0]] if len(order) > 1 else 0.0) if sure else 0.0
+    return Athlete(chosen, _said(views, chosen, how, lead, people.agreement(order[0])))
 
 
-def _said(views: Sequence[View], people: _People, order: Sequence[int], how: str, lead: float) -> tuple[str, ...]:
-    chosen = people.rows[order[0]]
+def _said(views: Sequence[View], chosen: Sequence[Rows], how: str, lead: float, share: float | None) -> tuple[str, ...]:
     seen = ", ".join(
         f"{view.name} {len(rows)} of {len(np.unique(view.frames))}" for view, rows in zip(views, chosen, strict=True)
     )
     who = {"stick": "who is nearest to the stick", "largest": "who is largest in the images", "central": "who is in the middle",
            "moving": "who moves most"}[how]  # fmt: skip
-    share = people.agreement(order[0])
     known = "" if share is None else f" In {share:.0%} of the frames, the cameras agree on who it is."
     said = f"Several people are in view. The athlete is taken to be the one {who}; frames with the athlete: {seen}.{known}"
-    if lead >= _CLEAR and (share is None or share > 0.7):
+    if lead >= _CLEAR and (share is None or share > _AGREEING):
         return (said,)
     return (f"{said} This is not sure; --person chooses another.",)
 
@@ -137,6 +138,21 @@ class _People:
         self._affinity, self._compared = self._affinities(views)
         self._groups = _grouped(self._affinity)
         self.rows = [tuple(self._joined(group, camera) for camera in range(len(views))) for group in self._groups]
+
+    def completed(self, order: Sequence[int]) -> tuple[tuple[Rows, ...], bool]:
+        """The rows of the first of some people, in order of preference; and whether all cameras could be compared.
+
+        Where a camera could not be compared with the others, the first person in the order whom it saw is taken.
+        """
+        rows = list(self.rows[order[0]])
+        compared = True
+        for camera in [camera for camera, own in enumerate(rows) if not len(own)]:
+            for person in order[1:]:
+                linked = self._compared[np.ix_(self._groups[order[0]], self._groups[person])].any()
+                if len(self.rows[person][camera]) and not linked:
+                    rows[camera], compared = self.rows[person][camera], False
+                    break
+        return tuple(rows), compared
 
     def agreement(self, person: int) -> float | None:
         """Share of the frames, seen by two cameras, in which these agree on a person; None if none was compared."""
@@ -179,19 +195,20 @@ class _People:
         """Compare the tracklets of two cameras by the essential matrix that explains most of them."""
         pairs = {(a, b): pair for a in own for b in others if (pair := self._common(a, b)) is not None}
         longest = [(a, b) for a in own[:_TRIED_TRACKLETS] for b in others[:_TRIED_TRACKLETS] if (a, b) in pairs]
-        best: tuple[float, dict[tuple[int, int], Array], float] | None = None
+        best: tuple[float, Array, float] | None = None
         for key in longest:
             essential = _essential(*pairs[key])
             if essential is None:
                 continue
-            residuals = {other: _residuals(essential, *pair) for other, pair in pairs.items()}
+            residuals = {other: _residuals(essential, *pairs[other]) for other in longest}
             tolerance = max(_LEAST_TOLERANCE, _CONSISTENT_SPREADS * float(np.median(residuals[key])))
             support = sum(float(np.maximum(0, 1 - r / tolerance).sum()) for r in residuals.values()) / tolerance**0.5
             if best is None or support > best[0]:
-                best = support, residuals, tolerance
+                best = support, essential, tolerance
         if best is None:
             return
-        for (a, b), residual in best[1].items():
+        for (a, b), pair in pairs.items():
+            residual = _residuals(best[1], *pair)
             affinity[a, b] = float(np.clip(1 - residual / best[2], -1, 1).sum())
             compared[a, b] = len(residual)
 
