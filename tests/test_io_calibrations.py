@@ -289,6 +289,18 @@ def test_intrinsics_alone(tmp_path: Path):
         found.poses()
 
 
+def test_names_with_leading_zeros_and_numbers_without_points(tmp_path: Path):
+    """As programs write them, and as YAML misunderstands them."""
+    matrix = "{rows: 3, cols: 3, dt: d, data: [1e3, 0, 640, 0, 1.e+3, 360, 0, 0, 1]}"
+    text = f"%YAML:1.0\nnames:\n  - 01\n  - 02\nK_01: {matrix}\ndist_01: [1e-3, 0, 0, 0]\nK_02: {matrix}\n"
+    put(tmp_path / "intri.yml", text)
+    found = read_calibration(tmp_path / "intri.yml", "easymocap")
+    assert found.names == ("01", "02")
+    assert found.intrinsics[1, 0, 0] == found.intrinsics[1, 1, 1] == 1000
+    assert [len(lens) for lens in found.distortion] == [4, 0]
+    assert found.image_size is None or bool(found.image_size.isnan().all())
+
+
 def test_the_real_files(data: Path):
     ewand = read_calibration(data / "formats" / "opencv_filestorage_ewand.yaml")
     assert ewand.names == ("cam0",)

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
+import pickle
 import shutil
+import sys
 from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
@@ -22,13 +24,16 @@ from torchstickcal.io import (
     Given,
     Recording,
     View,
+    complete,
     find_reader,
     load_session,
     read_recording,
     read_session,
+    recording_of_movement,
     write_npz,
 )
 from torchstickcal.io.formats import head_of
+from torchstickcal.io.skeletons import conventional, skeleton
 from torchstickcal.simulate import golf_session
 
 WIDTH, HEIGHT = 1920, 1080
@@ -398,9 +403,58 @@ def recording(firsts: tuple[int, ...], count: int = 4, points: int = 2, size: tu
     )
 
 
-def test_frames_are_matched_by_their_numbers():
-    from torchstickcal.io.given import complete
+@pytest.mark.parametrize("name", ["{}", "video_{}_keypoints", "cam01_25fps_{}_pose2d", "{}-v2"])
+def test_frames_are_numbered_in_any_usual_way(name: str, tmp_path: Path):
+    for camera in ("a", "b"):
+        for frame in (2, 10, 9):
+            person = {"pose_keypoints_2d": [frame, 1, 1, 5, 5, 1]}
+            put(tmp_path / camera / f"{name.format(frame)}.json", {"people": [person]})
+    assert [view.frames.tolist() for view in read_recording(tmp_path).views] == [[2, 9, 10]] * 2
+    put(tmp_path / "a" / "last.json", {"people": []})
+    with pytest.raises(FileFormatError, match="files of frames are not numbered"):
+        read_recording(tmp_path)
 
+
+class Labelled(np.ndarray):
+    """As much of an array of xarray as is used."""
+
+    axes: tuple[str, ...]
+
+    @classmethod
+    def of(cls, values: np.ndarray, *axes: str) -> Labelled:
+        array = values.view(cls)
+        array.axes = axes
+        return array
+
+    @property
+    def values(self) -> np.ndarray:
+        return np.asarray(self)
+
+    def transpose(self, *axes: str) -> Labelled:  # type: ignore[override]
+        return Labelled.of(np.transpose(np.asarray(self), [self.axes.index(axis) for axis in axes]), *axes)
+
+
+def test_datasets_of_movement(session: Session):
+    class Dataset(dict):
+        attrs = {"fps": 50}  # noqa: RUF012
+
+    def dataset(camera: int) -> Dataset:
+        keypoints, scores = session[0][camera], session[1][camera]
+        return Dataset(
+            position=Labelled.of(keypoints.transpose(0, 2, 1)[..., None].copy(), "time", "space", "keypoints", "individuals"),
+            confidence=Labelled.of(scores[..., None].copy(), "time", "keypoints", "individuals"),
+            keypoints=Labelled.of(np.array(session[2]), "keypoints"),
+        )
+
+    found = recording_of_movement({name: dataset(camera) for camera, name in enumerate(CAMERAS)})
+    observations, _ = complete(found, Given(Stick("club_grip", "club_head", 1.0), image_size=(WIDTH, HEIGHT)))
+    assert observations.fps == 50
+    np.testing.assert_array_equal(observations.keypoints.numpy(), session[0])
+    with pytest.raises(FileFormatError, match="datasets of movement"):
+        recording_of_movement({"a": {"position": np.zeros(3)}})
+
+
+def test_frames_are_matched_by_their_numbers():
     given = Given(Stick(0, 1, 1.0), image_size=(640, 480))
     observations, notes = complete(recording((3, 5)), given)
     assert observations.num_frames == 6
@@ -417,8 +471,6 @@ def test_frames_are_matched_by_their_numbers():
 
 
 def test_skeletons_have_names():
-    from torchstickcal.io.skeletons import conventional, skeleton
-
     for names in SKELETONS.values():
         assert len(set(names)) == len(names)
         assert [conventional(name) for name in names] == list(names)
@@ -446,8 +498,6 @@ def test_skeletons_have_names():
     ],
 )
 def test_a_skeleton_of_one_s_own(content: str, message: str, tmp_path: Path):
-    from torchstickcal.io.given import complete
-
     path = tmp_path / "mine.toml"
     given = Given(Stick("knob", "barrel", 1.0), image_size=(640, 480), skeleton=str(path))
     path.write_text('points = ["knob", "barrel"]')
@@ -459,16 +509,12 @@ def test_a_skeleton_of_one_s_own(content: str, message: str, tmp_path: Path):
 
 @pytest.mark.parametrize("name", ["right_knee", "RKnee", "knee_right", "Right Knee", "r_knee", "rknee"])
 def test_points_are_found_by_any_usual_name(name: str):
-    from torchstickcal.io.given import complete
-
     observations, notes = complete(recording((0, 0), points=17), Given(Stick(name, "RAnkle", 0.4), image_size=(640, 480)))
     assert observations.sticks[0].ends == (14, 16)
     assert "taken to be coco-17, by its 17 points" in notes[0]
 
 
 def test_what_is_not_known_is_asked_for():
-    from torchstickcal.io.given import complete
-
     stick = Stick(0, 1, 1.0)
     with pytest.raises(CalibrationError, match=r"no stick.*the points are point 0, point 1.*--stick START END METRES"):
         complete(recording((0, 0)), Given(image_size=(640, 480)))
@@ -482,8 +528,6 @@ def test_what_is_not_known_is_asked_for():
 
 
 def test_the_stick_may_be_in_files_of_its_own():
-    from torchstickcal.io.given import complete
-
     body, stick = recording((0, 0), points=17), recording((0, 0))
     named = Recording.of([View(v.name, v.frames, v.keypoints, v.persons, ("knob", "barrel")) for v in reversed(stick.views)])
     given = Given(Stick("knob", "barrel", 0.864), image_size=(640, 480), stick_points=named)
@@ -582,8 +626,6 @@ def test_hdf5(flavour: str, session: Session, tmp_path: Path):
             columns = [("DLC", point, axis) for point in session[2] for axis in ("x", "y", "likelihood")]
             rows = values.reshape(len(values), -1)
             if flavour == "table":
-                import pickle
-
                 kind = [("index", "<i8"), ("values_block_0", "<f8", rows.shape[1:])]
                 records = np.zeros(len(rows), dtype=kind)
                 records["index"], records["values_block_0"] = np.arange(len(rows)), rows
@@ -604,7 +646,7 @@ def test_hdf5(flavour: str, session: Session, tmp_path: Path):
 
 
 def test_hdf5_without_h5py_says_what_to_install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setitem(__import__("sys").modules, "h5py", None)
+    monkeypatch.setitem(sys.modules, "h5py", None)
     monkeypatch.setattr("torchstickcal.io.deeplabcut.h5_can_be_read", lambda: False)
     for name in ("a", "b"):
         (tmp_path / f"{name}.h5").write_bytes(b"\x89HDF\r\n\x1a\n" + bytes(100))

@@ -15,7 +15,7 @@ from torchstickcal.untrusted import read_rows, read_toml
 
 _POINTS = "Caliscope: points seen by all cameras (.csv)"
 _CAMERAS = "cameras of Caliscope, in metres (.toml)"
-_MOST_POINTS = 1000
+_MOST_POINTS = 200
 """Numbers of points from here on are names of their own, not places in a skeleton."""
 
 

@@ -71,8 +71,8 @@ def read_easymocap_cameras(path: str | Path) -> Rig:
         intrinsics = read_yaml(_intrinsics_of(path))
         poses = _intrinsics_of(path).parent / "extri.yml"
         extrinsics = read_yaml(poses) if poses.is_file() else {}
-        names = intrinsics.get("names") or [key[2:] for key in intrinsics if key.startswith("K_")]
-        return Rig.of([_camera(str(name), intrinsics, extrinsics) for name in names])
+        names = [key.removeprefix("K_") for key in intrinsics if key.startswith("K_")]  # `names` may have lost its zeros
+        return Rig.of([_camera(name, intrinsics, extrinsics) for name in names])
 
 
 def _camera(name: str, intrinsics: Mapping[str, Any], extrinsics: Mapping[str, Any]) -> RigCamera:

@@ -23,7 +23,7 @@ from torchstickcal.io.skeletons import point_named, skeleton, skeletons_of
 from torchstickcal.observations import Observations
 from torchstickcal.stick import Stick, located_sticks
 
-_MOST_EMPTY_FRAMES = 10_000
+_MOST_EMPTY_FRAMES = 1000
 _MOST_EMPTY_SHARE = 20
 """How many times more frames than those with a detection a recording may have, beside the number above."""
 _HALFWAY = 0.2

@@ -39,11 +39,11 @@ def _camera(name: str, values: Mapping[str, Any], pose: Any) -> RigCamera:
         raise ValueError(
             f"{name} of the model {values['camera_model']} with {model} distortion; pinhole with {', '.join(_MODELS)} is read"
         )
-    fx, fy, cx, cy = values["intrinsics"]
+    fx, fy, cx, cy = map(float, values["intrinsics"])
     return RigCamera(
         name=name,
         matrix=[[fx, 0, cx], [0, fy, cy], [0, 0, 1]],
-        distortion=values["distortion_coeffs"] if model != "none" else (),
+        distortion=list(map(float, values["distortion_coeffs"])) if model != "none" else (),
         fisheye=_MODELS[model],
         image_size=values["resolution"],
         rotation=pose[:3, :3],

@@ -188,7 +188,8 @@ class _People:
         gap = view.frames[later[0]] - view.frames[earlier[-1]]
         if gap <= 0 or gap > _LONGEST_GAP:
             return 0.0
-        distance = _distance(_expected(view, list(earlier), int(view.frames[later[0]])), view.keypoints[later[0]])
+        expected = _expected(view, list(earlier), int(view.frames[later[0]]))
+        distance = float(_distances(expected[None], view.keypoints[later[:1]])[0, 0])
         return float(_CONTINUITY * max(0.0, 1 - distance / _FARTHEST_STEP) / gap)
 
     def _compare(self, own: Sequence[int], others: Sequence[int], affinity: Array, compared: Array) -> None:
@@ -239,9 +240,8 @@ def _tracklets(view: View) -> list[Rows]:
         lost = [tracklet for tracklet in active if frame - view.frames[tracklet[-1]] > _LONGEST_GAP]
         finished += lost
         active = [tracklet for tracklet in active if tracklet not in lost]
-        distances = np.array(
-            [[_distance(_expected(view, tracklet, frame), view.keypoints[row]) for row in rows] for tracklet in active]
-        ).reshape(len(active), len(rows))
+        expected = np.stack([_expected(view, tracklet, frame) for tracklet in active]) if active else view.keypoints[:0]
+        distances = _distances(expected, view.keypoints[rows])
         following, ambiguous = _followed(distances)
         finished += [active[index] for index in ambiguous]
         for index, column in following.items():
@@ -280,13 +280,21 @@ def _expected(view: View, tracklet: Sequence[int], frame: int) -> Array:
     return moved
 
 
-def _distance(a: Array, b: Array) -> float:
-    """The median distance of the points (P, 3) of two detections, in lengths of their diagonal; infinity if few are common."""
-    common = _both(a, b)
-    if common.sum() < min(_COMMON_POINTS, len(common)):
-        return np.inf
-    size = max(_diagonal(a[None])[0], _diagonal(b[None])[0], 1.0)
-    return float(np.median(np.linalg.norm(a[common, :2] - b[common, :2], axis=1))) / size
+def _distances(a: Array, b: Array) -> Array:
+    """The median distances (A, B) of the points of detections (A, P, 3) and (B, P, 3), in lengths of the larger's diagonal.
+
+    Infinity for two detections with few common points.
+    """
+    between = np.linalg.norm(a[:, None, :, :2] - b[None, :, :, :2], axis=-1)
+    enough = np.isfinite(between).sum(-1) >= min(_COMMON_POINTS, a.shape[1])
+    sizes = np.maximum(np.maximum(_diagonal(a)[:, None], _diagonal(b)), 1.0)
+    return np.where(enough, _median(between), np.inf) / sizes
+
+
+def _median(values: Array) -> Array:
+    """The lower median (...) of those of some values (..., n) that are not NaN; NaN where there is none."""
+    middle = np.maximum(np.isfinite(values).sum(-1, keepdims=True) - 1, 0) // 2
+    return np.take_along_axis(np.sort(values, axis=-1), middle, axis=-1)[..., 0]
 
 
 def _both(a: Array, b: Array) -> NDArray[np.bool_]:
@@ -336,7 +344,7 @@ def _residuals(essential: Array, a: Array, b: Array) -> Array:
     first, second = np.concatenate([a, ones], -1), np.concatenate([b, ones], -1)
     lines_b, lines_a = first @ essential.T, second @ essential
     algebraic = np.abs((second * lines_b).sum(-1))
-    return np.nanmedian(algebraic / np.sqrt((lines_a[..., :2] ** 2).sum(-1) + (lines_b[..., :2] ** 2).sum(-1) + 1e-300), axis=1)
+    return _median(algebraic / np.sqrt((lines_a[..., :2] ** 2).sum(-1) + (lines_b[..., :2] ** 2).sum(-1) + 1e-300))
 
 
 def _rays(views: Sequence[View], cameras: Intrinsics | None, sizes: Sequence[Array]) -> list[Array]:

@@ -214,24 +214,25 @@ def in_folder(folder: Path, pattern: str = "*") -> list[Path]:
 
 
 def frame_files(folder: Path, pattern: str) -> list[tuple[int, Path]]:
-    """The files of a folder that hold one frame each, with the numbers of their frames: the last number in their names.
+    """The files of a folder that hold one frame each, with the numbers of their frames, in their order.
+
+    The number of a frame is the last number in the name that is another one in every file.
 
     Raises:
-        FileFormatError: if a name has no number, or two files have one number.
+        FileFormatError: if the names have no such number.
     """
-    numbered: dict[int, Path] = {}
-    for path in in_folder(folder, pattern):
-        number = last_number(path.stem)
-        if number is None or number in numbered:
-            got = f"{path.name}, without a number" if number is None else f"{numbered[number].name} and {path.name}"
-            raise FileFormatError(
-                "files of frames are not numbered",
-                where=str(folder),
-                got=got,
-                expected="a file for each frame, with the frame's number at the end of its name, each number once",
-            )
-        numbered[number] = path
-    return sorted(numbered.items())
+    files = in_folder(folder, pattern)
+    numbers = [[int(digits) for digits in _DIGITS.findall(path.stem) if len(digits) <= _LONGEST_NUMBER] for path in files]
+    for place in range(1, min(map(len, numbers), default=0) + 1):
+        frames = [own[-place] for own in numbers]
+        if len(set(frames)) == len(files):
+            return sorted(zip(frames, files, strict=True))
+    raise FileFormatError(
+        "files of frames are not numbered",
+        where=str(folder),
+        got=", ".join(path.name for path in files[:3]) or f"no {pattern}",
+        expected="a file for each frame, with the number of the frame at the end of its name",
+    )
 
 
 def _arranged(view: View, names: tuple[str, ...]) -> View:
