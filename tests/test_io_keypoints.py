@@ -527,6 +527,64 @@ def test_what_is_not_known_is_asked_for():
         complete(recording((0, 0), points=25), Given(stick, image_size=(640, 480)))
 
 
+def test_an_image_size_that_contradicts_the_files_is_refused():
+    with pytest.raises(CalibrationError, match=r"another image size than the files say .*c0\): got \[320.0, 240.0\]"):
+        complete(recording((0, 0), size=(640, 480)), Given(Stick(0, 1, 1.0), image_size=(320, 240)))
+    for size in ((640,), 5, [[1, 2]] * 3):
+        with pytest.raises(CalibrationError, match="image size is not usable"):
+            complete(recording((0, 0)), Given(Stick(0, 1, 1.0), image_size=size))
+
+
+def calib_toml(observations: Observations, names: tuple[str, ...]) -> str:
+    """Intrinsics as Pose2Sim writes them."""
+    text = ""
+    assert observations.distortion is not None
+    for name, matrix, lens in zip(names, observations.cameras.matrix, observations.distortion, strict=True):
+        text += f'[{name}]\nname = "{name}"\nsize = [ {WIDTH}.0, {HEIGHT}.0]\nmatrix = {matrix.tolist()}\n'
+        text += f"distortions = {lens[:4].tolist()}\nrotation = [ 0.0, 0.0, 0.0]\ntranslation = [ 0.0, 0.0, 1.0]\n"
+        text += "fisheye = false\n\n"
+    return text + "[metadata]\nadjusted = false\n"
+
+
+def test_a_folder_of_keypoints_and_a_calibration_give_the_rig(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    """By one command; the cameras of the calibration are in another order and have other names."""
+    observations, truth = golf_session(cameras=3, frames=20)
+    assert observations.point_names
+    keypoints = observations.keypoints.numpy()
+    openpose(tmp_path / "keypoints", (keypoints, np.ones(keypoints.shape[:3]), list(observations.point_names)))
+    put(tmp_path / "points.toml", f"points = {json.dumps(observations.point_names)}")
+    put(tmp_path / "Calib.toml", calib_toml(observations, ("int_2", "int_9", "int_10")))
+    stick = observations.sticks[0]
+    command = ["calibrate", str(tmp_path / "keypoints"), "--stick", "ClubGrip", "club_head", str(stick.length_m), "--fps", "60"]
+    command += ["--intrinsics", str(tmp_path / "Calib.toml"), "--skeleton", str(tmp_path / "points.toml")]
+    assert main([*command, "--out", str(tmp_path / "out")]) == 0
+    assert "cam10 = int_10" in capsys.readouterr().err
+    write_npz(tmp_path / "truth.npz", observations, truth)
+    assert main(["evaluate", str(tmp_path / "out"), str(tmp_path / "truth.npz"), "--json", str(tmp_path / "e.json")]) == 0
+    errors = json.loads((tmp_path / "e.json").read_text())
+    assert errors["mean_rotation_deg"] < 1e-3
+    assert errors["mean_translation_m"] < 1e-4
+
+
+def test_the_calibration_of_a_project_is_used(session: Session, tmp_path: Path):
+    pose2sim(tmp_path, session)
+    observations, _ = golf_session(cameras=3, frames=6)
+    put(tmp_path / "Config.toml", "[project]\nframe_rate = 'auto'\n[pose]\npose_model = 'Body'\n")
+    put(tmp_path / "calibration" / "Calib.toml", calib_toml(observations, CAMERAS))
+    put(tmp_path / "calibration" / "notes.txt", "a fine day")
+    found = read_recording(tmp_path)
+    assert found.intrinsics == (tmp_path / "calibration" / "Calib.toml").resolve()
+    assert (found.skeleton, found.fps) == ("coco-17", None)
+    with pytest.raises(CalibrationError, match=r"a skeleton with another number of points .*got 17 names; expected 21"):
+        read_session(tmp_path, given=Given(Stick(19, 20, 1.0)))
+    put(tmp_path / "Config.toml", "")
+    read, _ = read_session(tmp_path, given=Given(Stick(19, 20, 1.0)))
+    torch.testing.assert_close(read.intrinsics, observations.cameras.matrix)
+    put(tmp_path / "calibration" / "old.toml", calib_toml(observations, CAMERAS))
+    with pytest.raises(FileFormatError, match=r"several calibrations in one project .*Calib.toml, old.toml.*--intrinsics"):
+        read_recording(tmp_path)
+
+
 def test_the_stick_may_be_in_files_of_its_own():
     body, stick = recording((0, 0), points=17), recording((0, 0))
     named = Recording.of([View(v.name, v.frames, v.keypoints, v.persons, ("knob", "barrel")) for v in reversed(stick.views)])

@@ -12,6 +12,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from torchstickcal.arrays import tensor_of
 from torchstickcal.errors import CalibrationError, FileFormatError
 from torchstickcal.geometry.cameras import Intrinsics
 from torchstickcal.io.formats import read_calibration
@@ -61,7 +62,7 @@ class Given:
     image_size: Any = None
     fps: float | None = None
     skeleton: str | None = None
-    person: str = AUTOMATIC
+    person: str | int = AUTOMATIC
     stick_points: Recording | None = None
 
 
@@ -92,7 +93,7 @@ def complete(recording: Recording, given: Given) -> tuple[Observations, tuple[st
     numbers, shifts, sentences = _frame_numbers(recording.views)
     notes += sentences
     cameras = None if lenses.intrinsics is None else Intrinsics(lenses.intrinsics, lenses.distortion, lenses.fisheye)
-    athlete = athlete_of(views, shifts, given.person, names, cameras, lenses.image_size, stick_views)
+    athlete = athlete_of(views, shifts, str(given.person), names, cameras, lenses.image_size, stick_views)
     notes += athlete.notes
     keypoints = _by_frame(athlete, views, shifts, numbers)
     if stick is not None and stick_views is not None:
@@ -101,7 +102,7 @@ def complete(recording: Recording, given: Given) -> tuple[Observations, tuple[st
         names = (*names, *(stick.point_names or (f"stick {number}" for number in range(stick.num_points))))
         notes += stick.notes
     keypoints, sentences = _scored(keypoints)
-    lenses.check_inside(keypoints)
+    lenses.check_inside(keypoints, [view.name for view in views])
     observations = Observations(
         keypoints[..., :2],
         lenses.intrinsics,
@@ -140,7 +141,7 @@ def amended(observations: Observations, given: Given) -> tuple[Observations, tup
     if given.fps is not None:
         changes["fps"] = given.fps
     if given.intrinsics is not None:
-        size = observations.image_size if given.image_size is None else torch.as_tensor(given.image_size)
+        size = observations.image_size if given.image_size is None else tensor_of(given.image_size, "image_size")
         lenses, notes = lenses_of(
             _rig(given.intrinsics), observations.camera_labels, _per_camera(size, observations.num_cameras)
         )
@@ -224,8 +225,7 @@ def _lenses(recording: Recording, given: Given) -> tuple[Lenses, list[str]]:
     labels = tuple(view.name for view in recording.views)
     sizes = [view.image_size for view in recording.views]
     told = torch.tensor([size or (torch.nan, torch.nan) for size in sizes], dtype=torch.float64)
-    size = told if given.image_size is None else _per_camera(torch.as_tensor(given.image_size), len(labels))
-    assert size is not None
+    size = told if given.image_size is None else _sizes(given.image_size, labels, told)
     source = recording.intrinsics if given.intrinsics is None else given.intrinsics
     if source is not None:
         lenses, notes = lenses_of(_rig(source), labels, size)
@@ -243,6 +243,25 @@ def _lenses(recording: Recording, given: Given) -> tuple[Lenses, list[str]]:
 
 def _rig(source: Rig | str | Path) -> Rig:
     return source if isinstance(source, Rig) else read_calibration(source)
+
+
+def _sizes(given: Any, labels: Sequence[str], told: Tensor) -> Tensor:
+    """The given image sizes (C, 2).
+
+    Raises:
+        CalibrationError: if they are others than the files say.
+    """
+    size = tensor_of(given, "image_size").double()
+    if tuple(size.shape) not in {(2,), (len(labels), 2)}:
+        expected = f"(2,) or ({len(labels)}, 2): width, height in pixels"
+        raise CalibrationError("image size is not usable", where="image_size", got=size.tolist(), expected=expected)
+    size = size.expand(len(labels), 2)
+    for label, own, read in zip(labels, size.tolist(), told.tolist(), strict=True):
+        if not any(np.isnan(read)) and own != read:
+            raise CalibrationError(
+                "another image size than the files say", where=f"image_size of {label}", got=own, expected=f"{read}, or none"
+            )
+    return size
 
 
 def _per_camera(size: Tensor | None, cameras: int) -> Tensor | None:

@@ -35,7 +35,7 @@ class Lenses:
     image_size: Tensor | None
     """(C, 2), width and height, pixels"""
 
-    def check_inside(self, keypoints: NDArray[np.float64]) -> None:
+    def check_inside(self, keypoints: NDArray[np.float64], labels: Sequence[str]) -> None:
         """Raise a CalibrationError if many keypoints (C, F, P, 3) of a camera lie outside its image."""
         if self.image_size is None:
             return
@@ -45,7 +45,7 @@ class Lenses:
             if len(seen) and outside.mean() > _MOST_OUTSIDE:
                 raise CalibrationError(
                     "keypoints lie outside the image",
-                    where=f"camera {camera}",
+                    where=f"camera {labels[camera]}",
                     got=f"{outside.mean():.0%} of them, up to x {seen[:, 0].max():.0f} and y {seen[:, 1].max():.0f}",
                     expected=f"an image of {size[0]:g} x {size[1]:g} pixels",
                     remedy="If the images were made smaller or larger after the calibration, give their size (--image-size).",

@@ -42,7 +42,7 @@ def read_openpose(path: Path) -> View:
 
 def _people(frame: int, file: Path) -> list[Detection]:
     found = []
-    for person in read_json(file)["people"]:
+    for person in filter(None, read_json(file)["people"]):  # Pose2Sim leaves {} in the place of a person who was not seen
         keypoints = np.array(person["pose_keypoints_2d"], dtype=np.float64).reshape(-1, 3)
         if len(keypoints):
             found.append(Detection(frame, keypoints, _number(person.get("person_id"))))

@@ -135,8 +135,9 @@ class _People:
         tracklets = [(camera, rows) for camera, view in enumerate(views) for rows in _tracklets(view)]
         tracklets.sort(key=lambda tracklet: (-len(tracklet[1]), tracklet[0], tracklet[1][0]))
         self._tracklets = tracklets[:_MOST_TRACKLETS]
-        self._affinity, self._compared = self._affinities(views)
-        self._groups = _grouped(self._affinity)
+        count = len(self._tracklets)
+        self._compared, self._agreed = np.zeros((count, count)), np.zeros((count, count))
+        self._groups = _grouped(self._affinities(views))
         self.rows = [tuple(self._joined(group, camera) for camera in range(len(views))) for group in self._groups]
 
     def completed(self, order: Sequence[int]) -> tuple[tuple[Rows, ...], bool]:
@@ -160,24 +161,24 @@ class _People:
         compared = self._compared[np.ix_(group, group)].sum()
         if not compared:
             return None
-        agreed = np.where(self._compared > 0, self._affinity, 0.0)[np.ix_(group, group)].sum()
-        return float(np.clip((agreed / compared + 1) / 2, 0, 1))
+        return float(self._agreed[np.ix_(group, group)].sum() / compared)
 
     def _joined(self, group: Sequence[int], camera: int) -> Rows:
         rows = [rows for own, rows in (self._tracklets[index] for index in group) if own == camera]
         return np.sort(np.concatenate(rows)) if rows else np.zeros(0, dtype=np.intp)
 
-    def _affinities(self, views: Sequence[View]) -> tuple[Array, Array]:
-        """How much speaks for two tracklets being one person, in frames; and in how many frames they were compared, (T, T)."""
-        count = len(self._tracklets)
-        affinity, compared = np.zeros((count, count)), np.zeros((count, count))
+    def _affinities(self, views: Sequence[View]) -> Array:
+        """How much speaks for two tracklets being one person (T, T), in frames; counts those in which they are compared."""
+        affinity = np.zeros_like(self._compared)
         by_camera = [[index for index, (own, _) in enumerate(self._tracklets) if own == camera] for camera in range(len(views))]
         for camera, own in enumerate(by_camera):
             for first, second in ((a, b) for a in own for b in own if a < b):
                 affinity[first, second] = self._continuity(views[camera], first, second)
             for other in range(camera + 1, len(views)):
-                self._compare(own, by_camera[other], affinity, compared)
-        return affinity + affinity.T, compared + compared.T
+                self._compare(own, by_camera[other], affinity)
+        self._compared += self._compared.T
+        self._agreed += self._agreed.T
+        return affinity + affinity.T
 
     def _continuity(self, view: View, first: int, second: int) -> float:
         """What speaks for two tracklets of one camera being one person: minus infinity if they overlap."""
@@ -192,7 +193,7 @@ class _People:
         distance = float(_distances(expected[None], view.keypoints[later[:1]])[0, 0])
         return float(_CONTINUITY * max(0.0, 1 - distance / _FARTHEST_STEP) / gap)
 
-    def _compare(self, own: Sequence[int], others: Sequence[int], affinity: Array, compared: Array) -> None:
+    def _compare(self, own: Sequence[int], others: Sequence[int], affinity: Array) -> None:
         """Compare the tracklets of two cameras by the essential matrix that explains most of them."""
         pairs = {(a, b): pair for a in own for b in others if (pair := self._common(a, b)) is not None}
         longest = [(a, b) for a in own[:_TRIED_TRACKLETS] for b in others[:_TRIED_TRACKLETS] if (a, b) in pairs]
@@ -211,7 +212,8 @@ class _People:
         for (a, b), pair in pairs.items():
             residual = _residuals(best[1], *pair)
             affinity[a, b] = float(np.clip(1 - residual / best[2], -1, 1).sum())
-            compared[a, b] = len(residual)
+            self._compared[a, b] = len(residual)
+            self._agreed[a, b] = (residual < best[2]).sum()
 
     def _common(self, first: int, second: int) -> tuple[Array, Array] | None:
         """The rays (n, P, 2) of two tracklets in the frames that they have in common; None if there are too few."""
