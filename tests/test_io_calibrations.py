@@ -301,6 +301,28 @@ def test_names_with_leading_zeros_and_numbers_without_points(tmp_path: Path):
     assert found.image_size is None or bool(found.image_size.isnan().all())
 
 
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        ("K_1: &a [1, 2]\ndist_1: *a\n", "an alias"),
+        ("K_1: !!python/object/apply:os.system ['true']\n", "could not determine a constructor"),
+        ("K_1: [1, 2]\n" + "#" * 2**20, "more than 1048576 bytes"),
+        ("K_1: {rows: 100000, cols: 100000, data: [1]}\n", "cannot reshape"),
+        ("K_1: [a, b]\n", "could not convert"),
+    ],
+)
+def test_yaml_that_would_do_more_than_it_says(content: str, message: str, tmp_path: Path):
+    put(tmp_path / "intri.yml", content)
+    with pytest.raises(FileFormatError, match=message):
+        read_calibration(tmp_path / "intri.yml")
+
+
+def test_xml_with_entities(tmp_path: Path):
+    put(tmp_path / "a.qca.txt", '<!DOCTYPE c [<!ENTITY a "aa">]><calibration><camera serial="&a;"/></calibration>')
+    with pytest.raises(FileFormatError, match="a document type"):
+        read_calibration(tmp_path / "a.qca.txt")
+
+
 def test_the_real_files(data: Path):
     ewand = read_calibration(data / "formats" / "opencv_filestorage_ewand.yaml")
     assert ewand.names == ("cam0",)

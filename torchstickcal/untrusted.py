@@ -30,7 +30,8 @@ below."""
 SLACK_BYTES = 16 * 2**20
 """What a file of any size may need in addition."""
 LONGEST_TOML_BYTES = 16 * 2**20
-LONGEST_YAML_BYTES = LONGEST_XML_BYTES = 4 * 2**20
+LONGEST_YAML_BYTES = 2**20
+LONGEST_XML_BYTES = 16 * 2**20
 _YAML_HEADER = re.compile(r"\A%YAML[^\n]*\n")
 """The first line of OpenCV's files, which other readers of YAML refuse."""
 _LONGEST_CAUSE = 300
@@ -279,7 +280,12 @@ class H5File:
 
 
 class _PlainLoader(yaml.SafeLoader):
-    """YAML as lists, dictionaries, numbers and texts, whatever tags it has."""
+    """YAML as lists, dictionaries, numbers and texts, whatever tags it has. Aliases, by which a file may grow, are refused."""
+
+    def compose_node(self, parent: yaml.Node | None, index: int) -> yaml.Node | None:
+        if self.check_event(yaml.AliasEvent):
+            raise ValueError("an alias (*name) for another part of the file")
+        return super().compose_node(parent, index)
 
 
 def _untagged(loader: _PlainLoader, _: str, node: yaml.Node) -> Any:
