@@ -95,13 +95,14 @@ def complete(recording: Recording, given: Given) -> tuple[Observations, tuple[st
     cameras = None if lenses.intrinsics is None else Intrinsics(lenses.intrinsics, lenses.distortion, lenses.fisheye)
     athlete = athlete_of(views, shifts, str(given.person), names, cameras, lenses.image_size, stick_views)
     notes += athlete.notes
-    keypoints = _by_frame(athlete, views, shifts, numbers)
+    keypoints, sentences = _scored(_by_frame(athlete, views, shifts, numbers))
+    notes += sentences
     if stick is not None and stick_views is not None:
         held = athlete_of(stick_views, shifts, AUTOMATIC, None, cameras, lenses.image_size, None)
-        keypoints = np.concatenate([keypoints, _by_frame(held, stick_views, shifts, numbers)], axis=2)
+        ends, sentences = _scored(_by_frame(held, stick_views, shifts, numbers))
+        notes += (*stick.notes, *sentences)
+        keypoints = np.concatenate([keypoints, ends], axis=2)
         names = (*names, *(stick.point_names or (f"stick {number}" for number in range(stick.num_points))))
-        notes += stick.notes
-    keypoints, sentences = _scored(keypoints)
     lenses.check_inside(keypoints, [view.name for view in views])
     observations = Observations(
         keypoints[..., :2],
@@ -115,7 +116,7 @@ def complete(recording: Recording, given: Given) -> tuple[Observations, tuple[st
         tuple(view.name for view in recording.views),
         lenses.fisheye,
     )
-    return observations, (*notes, *sentences)
+    return observations, tuple(notes)
 
 
 def amended(observations: Observations, given: Given) -> tuple[Observations, tuple[str, ...]]:

@@ -100,12 +100,13 @@ def athlete_of(
         return Athlete(tuple(np.arange(len(view.frames)) for view in views))
     size = _sizes(views, cameras, image_size)
     people = _People(views, shifts, _rays(views, cameras, size))
-    measure = _MEASURES[how]
-    scores = [
-        sum(measure(view, rows, size[camera], _hands(names), None if stick is None else stick[camera])
-            for camera, (view, rows) in enumerate(zip(views, person, strict=True)) if len(rows))
-        for person in people.rows
-    ]  # fmt: skip
+    measure, hands, sticks = _MEASURES[how], _hands(names), stick or [None] * len(views)
+
+    def score(person: Sequence[Rows]) -> float:
+        cameras_that_saw = [camera for camera, rows in enumerate(person) if len(rows)]
+        return sum(measure(views[c], person[c], size[c], hands, sticks[c]) for c in cameras_that_saw)
+
+    scores = list(map(score, people.rows))
     order = sorted(range(len(scores)), key=lambda index: (-scores[index], index))
     chosen, compared = people.completed(order)
     sure = compared and scores[order[0]] > 0
@@ -117,10 +118,10 @@ def _said(views: Sequence[View], chosen: Sequence[Rows], how: str, lead: float, 
     seen = ", ".join(
         f"{view.name} {len(rows)} of {len(np.unique(view.frames))}" for view, rows in zip(views, chosen, strict=True)
     )
-    who = {"stick": "who is nearest to the stick", "largest": "who is largest in the images", "central": "who is in the middle",
-           "moving": "who moves most"}[how]  # fmt: skip
     known = "" if share is None else f" In {share:.0%} of the frames, the cameras agree on who it is."
-    said = f"Several people are in view. The athlete is taken to be the one {who}; frames with the athlete: {seen}.{known}"
+    said = (
+        f"Several people are in view. The athlete is taken to be the one {_WHO[how]}; frames with the athlete: {seen}.{known}"
+    )
     if lead >= _CLEAR and (share is None or share > _AGREEING):
         return (said,)
     return (f"{said} This is not sure; --person chooses another.",)
@@ -431,6 +432,14 @@ def _holding(view: View, rows: Rows, size: Array, hands: list[int] | None, stick
             near += float(np.exp(-np.nanmin(between) / (_REACH * max(1.0, _diagonal(body[None])[0]))))
     return near / len(np.unique(view.frames))
 
+
+_WHO = {
+    "largest": "who is largest in the images",
+    "central": "who is in the middle",
+    "moving": "who moves most",
+    "stick": "who is nearest to the stick",
+}
+"""Words for each way to choose the athlete."""
 
 _MEASURES: dict[str, _Measure] = {"largest": _largest, "central": _central, "moving": _moving, "stick": _holding}
 """How much speaks for a person being the athlete, in one camera."""
