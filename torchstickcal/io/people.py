@@ -43,6 +43,8 @@ _CONTINUITY = 4.0
 """How much it counts, in frames of agreement between two cameras, that one tracklet begins where another ended."""
 _REACH = 0.25
 """How far from the stick its holder's hands are, in lengths of the holder's diagonal."""
+_NEAR = 0.5
+"""How much of the athlete's nearness to the stick somebody has who is taken for the athlete in a camera with another clock."""
 _AGREEING = 0.7
 """Least share of the frames in which cameras agree on the athlete, for the choice to be sure."""
 _CLEAR = 0.15
@@ -102,16 +104,16 @@ def athlete_of(
     people = _People(views, shifts, _rays(views, cameras, size))
     measure, hands, sticks = _MEASURES[how], _hands(names), stick or [None] * len(views)
 
-    def score(person: Sequence[Rows]) -> float:
-        cameras_that_saw = [camera for camera, rows in enumerate(person) if len(rows)]
-        return sum(measure(views[c], person[c], size[c], hands, sticks[c]) for c in cameras_that_saw)
+    def score(camera: int, rows: Rows) -> float:
+        return measure(views[camera], rows, size[camera], hands, sticks[camera]) if len(rows) else 0.0
 
-    scores = list(map(score, people.rows))
-    order = sorted(range(len(scores)), key=lambda index: (-scores[index], index))
-    chosen, compared = people.completed(order)
-    sure = compared and scores[order[0]] > 0
-    lead = 1 - (scores[order[1]] / scores[order[0]] if len(order) > 1 else 0.0) if sure else 0.0
-    return Athlete(chosen, _said(views, chosen, how, lead, people.agreement(order[0])))
+    scores = np.array([[score(camera, rows) for camera, rows in enumerate(person)] for person in people.rows])
+    total = scores.sum(1)
+    order = np.argsort(-total, kind="stable").tolist()
+    near = scores > _NEAR * scores[order[0]].max() if how == "stick" else np.zeros_like(scores, dtype=bool)
+    chosen, agreed = people.completed(order, near)
+    lead = 1 - (total[order[1]] / total[order[0]] if len(order) > 1 else 0.0) if total[order[0]] > 0 else 0.0
+    return Athlete(chosen, _said(views, chosen, how, lead if agreed else 0.0, people.agreement(order[0])))
 
 
 def _said(views: Sequence[View], chosen: Sequence[Rows], how: str, lead: float, share: float | None) -> tuple[str, ...]:
@@ -141,20 +143,21 @@ class _People:
         self._groups = _grouped(self._affinities(views))
         self.rows = [tuple(self._joined(group, camera) for camera in range(len(views))) for group in self._groups]
 
-    def completed(self, order: Sequence[int]) -> tuple[tuple[Rows, ...], bool]:
-        """The rows of the first of some people, in order of preference; and whether all cameras could be compared.
+    def completed(self, order: Sequence[int], near: NDArray[np.bool_]) -> tuple[tuple[Rows, ...], bool]:
+        """The rows of the first of some people, in order of preference; and whether this person is in every camera.
 
-        Where a camera could not be compared with the others, the first person in the order whom it saw is taken.
+        Where a camera does not have the person, the next one in the order is taken of whom it saw, if the camera could not be
+        compared with the others, or if ``near`` (people, cameras) says that this one has the stick.
         """
         rows = list(self.rows[order[0]])
-        compared = True
-        for camera in [camera for camera, own in enumerate(rows) if not len(own)]:
+        absent = [camera for camera, own in enumerate(rows) if not len(own)]
+        for camera in absent:
             for person in order[1:]:
                 linked = self._compared[np.ix_(self._groups[order[0]], self._groups[person])].any()
-                if len(self.rows[person][camera]) and not linked:
-                    rows[camera], compared = self.rows[person][camera], False
+                if len(self.rows[person][camera]) and (near[person, camera] or not linked):
+                    rows[camera] = self.rows[person][camera]
                     break
-        return tuple(rows), compared
+        return tuple(rows), not absent
 
     def agreement(self, person: int) -> float | None:
         """Share of the frames, seen by two cameras, in which these agree on a person; None if none was compared."""
