@@ -1,8 +1,11 @@
 PYTHON ?= python3
+PYTHON_OLDEST ?= python3.11
 VENV := .venv
+OLDEST := .venv-oldest
 INSTALLED := $(VENV)/.installed
+SEED ?= 0
 
-.PHONY: demo test quick test-slow lint clean
+.PHONY: demo test quick test-slow test-oldest fuzz lint clean
 
 # The matrices are small: one thread computes faster than several that wait for each other.
 PYTEST := OMP_NUM_THREADS=1 $(VENV)/bin/python -m pytest
@@ -21,6 +24,12 @@ quick: $(INSTALLED)
 test-slow: $(INSTALLED)
 	$(PYTEST) -m slow
 
+test-oldest: $(OLDEST)/.installed
+	OMP_NUM_THREADS=1 $(OLDEST)/bin/python -m pytest
+
+fuzz: $(INSTALLED)
+	TORCHSTICKCAL_FUZZ=large $(PYTEST) tests/fuzz --hypothesis-seed=$(SEED)
+
 lint: $(INSTALLED)
 	$(VENV)/bin/ruff check .
 	$(VENV)/bin/ruff format --check .
@@ -31,5 +40,10 @@ $(INSTALLED): pyproject.toml constraints.txt
 	$(VENV)/bin/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e ".[dev]"
 	touch $(INSTALLED)
 
+$(OLDEST)/.installed: pyproject.toml constraints-oldest.txt
+	$(PYTHON_OLDEST) -m venv $(OLDEST)
+	$(OLDEST)/bin/python -m pip install --quiet --disable-pip-version-check -c constraints-oldest.txt -e ".[test]"
+	touch $(OLDEST)/.installed
+
 clean:
-	rm -rf $(VENV) demo build dist *.egg-info
+	rm -rf $(VENV) $(OLDEST) demo build dist *.egg-info

@@ -46,7 +46,10 @@ def test_extending_changes_only_what_is_said(tmp_path: Path):
         ({"stages": {"metric": {"stick_lenght": {}}}}, r"stages.metric.stick_lenght.*Did you mean 'stick_length'\?"),
         ({"solver": "newton"}, r"unusable value.*solver.*'newton'.*'gauss_newton' or 'lbfgs'"),
         ({"stages": {"metric": {"max_iterations": 1.5}}}, r"max_iterations.*1\.5.*whole number"),
-        ({"stages": {"metric": {"reprojection": {"sigma_px": "guess"}}}}, r"sigma_px.*'guess'.*number above 0 or 'estimated'"),
+        (
+            {"stages": {"metric": {"reprojection": {"sigma_px": "guess"}}}},
+            r"sigma_px.*'guess'.*number above 0 and at most 1e9 or 'estimated'",
+        ),
         ({"stages": {"metric": {"stick_length": {"sigma_m": -1}}}}, r"sigma_m.*-1"),
         ({"stages": {"metric": {"rescale": 1}}}, r"rescale.*true or false"),
         ({"stages": {"metric": {"stick_length": 3}}}, "a table or false"),

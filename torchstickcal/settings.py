@@ -19,10 +19,12 @@ from torchstickcal.registry import Registry, suggestion
 
 _ABOVE_ZERO = "above 0"
 Positive = Annotated[float, _ABOVE_ZERO]
-"""A number above 0."""
+"""A number above 0, at most 1e9."""
 PositiveInt = Annotated[int, _ABOVE_ZERO]
-"""A whole number above 0."""
+"""A whole number above 0, at most 1e9."""
 
+_LARGEST = 1e9
+"""No setting is larger in its unit, and larger numbers overflow when they are squared."""
 _UNIONS = (types.UnionType, typing.Union)
 _LONGEST_VALUE = 200
 """Characters of a value that a message shows."""
@@ -129,7 +131,7 @@ def _fits(kind: Any, value: Any) -> bool:
     if isinstance(annotation, Registry):
         return isinstance(value, str) and value in annotation
     if annotation == _ABOVE_ZERO:
-        return _fits(_plain(kind), value) and value > 0
+        return _fits(_plain(kind), value) and 0 < value <= _LARGEST
     if typing.get_origin(kind) is Literal:
         return isinstance(value, str) and value in typing.get_args(kind)
     if typing.get_origin(kind) is list:
@@ -148,7 +150,7 @@ def _description(kind: Any) -> str:
     if isinstance(annotation, Registry):
         return f"one of {', '.join(annotation)}"
     if annotation == _ABOVE_ZERO:
-        return f"{_description(_plain(kind))} {_ABOVE_ZERO}"
+        return f"{_description(_plain(kind))} {_ABOVE_ZERO} and at most 1e9"
     if typing.get_origin(kind) is Literal:
         return " or ".join(repr(option) for option in typing.get_args(kind))
     if typing.get_origin(kind) is list:

@@ -86,7 +86,7 @@ def estimate_acceleration_m(measurements: Measurements, points: Tensor, point_va
         point_variance: variance of each triangulated point, mean over the three axes, (B, N), square metres.
     """
     complete = consecutive(measurements.by_frame(measurements.active), len(SmoothnessLoss.stencil))
-    x, noise = measurements.by_frame(points), measurements.by_frame(point_variance)
+    x, noise = measurements.by_frame(points), measurements.by_frame(point_variance).double()
     measured = combined(x, SmoothnessLoss.stencil, dim=-2).square().mean(1)
     expected = noise[:, 2:] + 4 * noise[:, 1:-1] + noise[:, :-2]
     weights = complete / expected.clamp_min(_MIN_ACCELERATION_M**2)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 from torch import Tensor
@@ -71,7 +72,7 @@ def summary(calibration: Calibration) -> dict[str, Any]:
                 "translation_m": translation,
                 "centre_std_m": std_m,
                 "rotation_std_deg": std_deg,
-                "reprojection_median_px": median_px,
+                "reprojection_median_px": median_px if math.isfinite(median_px) else None,
                 "keypoints": keypoints,
             }
             for name, centre, rotation, translation, std_m, std_deg, median_px, keypoints in zip(

@@ -48,5 +48,5 @@ def triangulate(
         depth = (rotations[:, 2] @ points + translations[:, 2:]).clamp_min(_MIN_DEPTH)
         algebraic = (rows * points).sum(2) - targets
         squared = algebraic.square().sum(0) / depth.square()
-        current = weights / (depth * (1 + squared / scale**2)).square()
+        current = weights / (depth * (1 + squared / scale / scale)).square()
     return points.where(~unseen, torch.nan)

@@ -30,6 +30,8 @@ def synchronise_keypoints(
 ) -> tuple[Measurements, StageResult, list[list[StageRecord]]]:
     """Move the keypoints to the common frames and run a stage with them, until the keypoints no longer move.
 
+    A session whose stage does not converge twice in a row is left as it is.
+
     Args:
         detected: the keypoints as detected.
         exposures: the exposure times of the keypoints.
@@ -44,10 +46,11 @@ def synchronise_keypoints(
     support = _support(measurements, result)
     unfinished = torch.ones(detected.sessions, dtype=torch.bool, device=detected.pixels.device)
     records: list[list[StageRecord]] = [[] for _ in range(detected.sessions)]
+    at_limit = torch.zeros_like(unfinished)
     for number in range(_MAX_ROUNDS):
         moved = exposures.at_common_times(detected, result.state, support)
         if number > 0:
-            unfinished = _have_moved(moved, measurements, result)
+            unfinished &= _have_moved(moved, measurements, result)
         measurements = moved
         if not bool(unfinished.any()):
             break
@@ -55,6 +58,8 @@ def synchronise_keypoints(
         for session, record, continued in zip(records, repeated.records, unfinished.tolist(), strict=True):
             session.extend([record] if continued else [])
         result = result.replaced(unfinished, repeated)
+        stopped = torch.tensor([not record.stop.converged for record in repeated.records], device=unfinished.device)
+        unfinished, at_limit = unfinished & ~(stopped & at_limit), stopped
         support = support.replaced(unfinished, _support(moved, result))
     return measurements, result, records
 

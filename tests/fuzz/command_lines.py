@@ -1,0 +1,108 @@
+"""Command lines: each command with its options, some of them with values that they cannot have."""
+
+from __future__ import annotations
+
+import functools
+import tempfile
+from pathlib import Path
+
+from hypothesis import strategies as st
+
+from fuzz.damaged import Damaged
+from fuzz.sessions import Spoiled
+from torchstickcal.io import write_npz
+from torchstickcal.simulate import Noise, golf_session
+
+FILES = {
+    "session.npz": lambda path: write_npz(path, *golf_session(cameras=3, frames=8, noise=Noise(0.5))),
+    "identical cameras.npz": lambda path: write_npz(path, Spoiled(spoils=("all_cameras_identical",)).observations()),
+    "without truth é.npz": lambda path: write_npz(path, Spoiled().observations()),
+    "damaged.npz": lambda path: path.write_bytes(Damaged("session .npz", ("cut_short",), 1).content()),
+    "sequence.pkl": lambda path: path.write_bytes(Damaged("session .pkl").content()),
+    "damaged.pkl": lambda path: path.write_bytes(Damaged("session .pkl", ("cut_short",), 1).content()),
+    "calibration.toml": lambda path: path.write_bytes(Damaged("cameras .toml").content()),
+    "points.npz": lambda path: path.write_bytes(Damaged("calibration .npz").content()),
+    "config.toml": lambda path: path.write_text('extends = "default"\n'),
+    "broken.toml": lambda path: path.write_text("stages = 1"),
+    "empty": lambda path: path.touch(),
+    "plugin.py": lambda path: path.write_text("x = 1\n"),
+    "broken.py": lambda path: path.write_text("1 / 0\n"),
+    "folder": lambda path: path.mkdir(),
+}
+"""What lies in the folder in which the commands are run."""
+
+
+def lay_out(folder: Path) -> None:
+    for name, content in _contents().items():
+        if content is None:
+            (folder / name).mkdir()
+        else:
+            (folder / name).write_bytes(content)
+
+
+@functools.cache
+def _contents() -> dict[str, bytes | None]:
+    """The files' contents, made once; None for a folder."""
+    with tempfile.TemporaryDirectory() as folder:
+        for name, write in FILES.items():
+            write(Path(folder, name))
+        return {name: None if (path := Path(folder, name)).is_dir() else path.read_bytes() for name in FILES}
+
+
+_NUMBERS = ["1", "0", "-1", "1.5", "1e-300", "1e308", "nan", "inf", "9" * 400, "", "x"]
+_OUT = ["out", "new/deep", "folder", "empty", "session.npz", "session.npz/below", "/dev/null", "a" * 300, "", "é", "\udcff"]
+_PATHS = ["session.npz", *FILES, "missing", ".", "/dev/null", "", "a" * 5000, "\udcff"]
+VALUES: dict[str, list[str] | None] = {
+    "--out": _OUT,
+    "--json": ["errors.json", *_OUT],
+    "--tensorboard": ["runs", "empty", "session.npz"],
+    "--format": ["npz", "sports-stick-syn", "pose2sim", "x", ""],
+    "--export": ["pose2sim", "pose2sim,pose2sim", "x", ",", ""],
+    "--config": ["default", "paper", "config.toml", "broken.toml", "missing.toml", "folder", "x", "", "\udcff"],
+    "--refine": ["auto", "none", "focal", "focal,time_offset", "x", ",", ""],
+    "--no-sync": None,
+    "--stick-length": ["1.2", *_NUMBERS],
+    "--stick-sigma": ["0.01", *_NUMBERS],
+    "--plugin": ["plugin.py", "broken.py", "missing.py", "folder", "x.y", "", "."],
+    "--count": ["1", "2", "0", "-1", "1.5", "x", ""],
+    "--seed": ["1", "-1", "1.5", "x", "9" * 400],
+    "--methods": ["default", "x", ",", ""],
+    "--jobs": ["1", "0", "-1", "1.5", "x"],
+    "--gif": None,
+}
+"""The values that are tried of each option; None for an option without one. Those that would take long are left out."""
+
+COMMANDS = {
+    "calibrate": (["session.npz"] * len(_PATHS) + _PATHS,),
+    "evaluate": (["calibration.toml"] * len(_PATHS) + _PATHS, _PATHS),
+    "simulate": (["wand", "golf", "x", "", "hard"],),
+    "benchmark": (["folder", "session.npz", "x", ".", "missing", ""],),
+    "list": (["losses", "formats", "x", ""],),
+}
+"""The values that are tried of each argument of each command."""
+FITTING = {
+    "calibrate": ["--format", "--export", "--config", "--refine", "--no-sync", "--stick-length", "--stick-sigma", "--plugin"],
+    "evaluate": ["--format", "--json", "--plugin"],
+    "simulate": ["--seed", "--plugin"],
+    "benchmark": ["--json", "--config", "--plugin", "--count"],
+    "list": ["--plugin"],
+}
+"""The options that a command takes, apart from those that it needs."""
+
+
+@st.composite
+def command_lines(draw: st.DrawFn) -> list[str]:
+    """A command, mostly with what it needs, and some options."""
+    command = draw(st.sampled_from(["calibrate"] * 4 + ["evaluate"] * 2 + [*COMMANDS]))
+    words = [command, *(draw(st.sampled_from(values)) for values in COMMANDS[command])]
+    if command == "simulate":
+        words += ["--count", draw(st.sampled_from(VALUES["--count"] or []))]
+    if command in ("calibrate", "simulate"):
+        words += ["--out", draw(st.sampled_from(["out"] * 6 + _OUT))]
+    options = draw(st.lists(st.sampled_from(FITTING[command]), max_size=2, unique=True))
+    if draw(st.integers(0, 9)) == 9:
+        options.append(draw(st.sampled_from(list(VALUES))))
+    for option in options:
+        values = VALUES[option]
+        words += [option] if values is None else [option, draw(st.one_of(st.just(values[0]), st.sampled_from(values)))]
+    return words
