@@ -18,8 +18,9 @@ from torch import Tensor
 
 from torchstickcal.files import atomic_path, check_text
 from torchstickcal.io.formats import calibration_reader, calibration_writer, reading
-from torchstickcal.io.rig import METRES, Rig, RigCamera
+from torchstickcal.io.rig import METRES, Rig, RigCamera, as_float64
 from torchstickcal.result import Calibration
+from torchstickcal.shapes import check_shapes
 from torchstickcal.untrusted import read_toml
 
 _NAME = "pose2sim"
@@ -114,12 +115,19 @@ def _rig_camera(key: str, table: dict[str, Any]) -> RigCamera:
     return RigCamera(
         name=_given(table, "name", str, key),
         matrix=table["matrix"],
-        distortion=table["distortions"],
+        distortion=_vector(table, "distortions"),
         fisheye=_given(table, "fisheye", bool, False),
         image_size=table["size"],
-        rotation=table["rotation"] if posed else None,
+        rotation=_vector(table, "rotation") if posed else None,
         translation=table["translation"] if posed else None,
     )
+
+
+def _vector(table: dict[str, Any], key: str) -> Tensor:
+    """A list of numbers of a camera's table; rotations are vectors in these files."""
+    vector = as_float64(key, table[key])
+    check_shapes(key, {key: vector}, {key: "3" if key == "rotation" else "D"})
+    return vector
 
 
 def _unit(cameras: dict[str, Any], metadata: dict[str, Any]) -> str | None:
