@@ -11,7 +11,7 @@ import pytest
 import torch
 
 from torchstickcal.benchmark import BASELINES
-from torchstickcal.io import CALIBRATION_READERS, CALIBRATION_WRITERS, SESSION_READERS, Truth
+from torchstickcal.io import CALIBRATION_READERS, CALIBRATION_WRITERS, KEYPOINT_READERS, SESSION_READERS, Truth
 from torchstickcal.losses import LOSSES
 from torchstickcal.model.measurements import Measurements
 from torchstickcal.model.state import State
@@ -34,7 +34,8 @@ def data() -> Path:
 @pytest.fixture
 def own_parts(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[tuple[Registry, ...]]:
     """The registries; forget at the end of the test what it registered, and the modules that it wrote and imported."""
-    registries = (BASELINES, CALIBRATION_READERS, CALIBRATION_WRITERS, LOSSES, REFINEMENTS, SESSION_READERS, SPORTS)
+    readers = (CALIBRATION_READERS, KEYPOINT_READERS, SESSION_READERS)
+    registries = (BASELINES, *readers, CALIBRATION_WRITERS, LOSSES, REFINEMENTS, SPORTS)
     for registry in registries:
         monkeypatch.setattr(registry, "_things", dict(registry))
     yield registries

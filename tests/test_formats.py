@@ -222,8 +222,14 @@ def example(decorator: Callable) -> None:
 
 
 def test_the_examples_of_the_decorators(own_parts, tmp_path: Path):
-    for decorator in (io.session_reader, io.calibration_reader, io.calibration_writer):
+    for decorator in (io.session_reader, io.keypoint_reader, io.camera_reader, io.calibration_reader, io.calibration_writer):
         example(decorator)
+    (tmp_path / "d").write_text('{"tiny": {"left": [[[10, 20], [30, 40]]], "right": [[[50, 60], [70, 80]]]}}')
+    assert [view.name for view in io.read_recording(tmp_path / "d").views] == ["left", "right"]
+    (tmp_path / "e").mkdir()
+    for name in ("left", "right"):
+        (tmp_path / "e" / name).write_text("words\n1 2 3 4\n5 6 7 8\n")
+    assert io.read_recording(tmp_path / "e").views[1].keypoints[1, :, :2].tolist() == [[5, 6], [7, 8]]
     (tmp_path / "a").write_text('{"toy": [[[[10, 20], [30, 40]]], [[[50, 60], [70, 80]]]]}')
     assert read_session(tmp_path / "a")[0].keypoints.shape == (2, 1, 2, 2)
     calibration = calibrate(golf_session(cameras=3, frames=10)[0])

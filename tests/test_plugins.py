@@ -11,7 +11,7 @@ from torchstickcal.benchmark import METHODS
 from torchstickcal.benchmark.run import CONVERGED, read_rows
 from torchstickcal.cli import main
 from torchstickcal.config import config_names
-from torchstickcal.io import CALIBRATION_READERS, CALIBRATION_WRITERS, SESSION_READERS, write_npz
+from torchstickcal.io import CALIBRATION_READERS, CALIBRATION_WRITERS, KEYPOINT_READERS, SESSION_READERS, write_npz
 from torchstickcal.losses import LOSSES
 from torchstickcal.model.unknowns import REFINEMENTS
 from torchstickcal.simulate import PRESETS, SPORTS, golf_session
@@ -178,7 +178,7 @@ def test_everything_that_is_registered_is_listed(plugin: str, capsys: pytest.Cap
     assert {kind: list(names) for kind, names in lists.items()} == {
         "losses": list(LOSSES),
         "unknowns": list(REFINEMENTS),
-        "formats": list(dict.fromkeys([*SESSION_READERS, *CALIBRATION_READERS, *CALIBRATION_WRITERS])),
+        "formats": list(dict.fromkeys([*SESSION_READERS, *KEYPOINT_READERS, *CALIBRATION_READERS, *CALIBRATION_WRITERS])),
         "sports": list(SPORTS),
         "presets": list(PRESETS),
         "baselines": [name for name in METHODS if name not in config_names()],

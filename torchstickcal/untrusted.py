@@ -2,16 +2,23 @@
 
 from __future__ import annotations
 
+import csv
+import importlib.util
+import io
+import json
 import math
 import os
+import re
 import stat
 import zipfile
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, BinaryIO
+from xml.etree import ElementTree
 
 import numpy as np
+import yaml
 from numpy.typing import NDArray
 
 from torchstickcal.errors import CalibrationError, FileFormatError
@@ -23,6 +30,10 @@ below."""
 SLACK_BYTES = 16 * 2**20
 """What a file of any size may need in addition."""
 LONGEST_TOML_BYTES = 16 * 2**20
+LONGEST_YAML_BYTES = 2**20
+LONGEST_XML_BYTES = 16 * 2**20
+_YAML_HEADER = re.compile(r"\A%YAML[^\n]*\n")
+"""The first line of OpenCV's files, which other readers of YAML refuse."""
 _LONGEST_CAUSE = 300
 """Characters of a foreign message that an error shows."""
 _MOST_EMPTY_ROWS = 10_000
@@ -116,6 +127,177 @@ def read_toml(path: str | Path) -> dict[str, Any]:
         if len(content) > LONGEST_TOML_BYTES:
             raise ValueError(f"more than {LONGEST_TOML_BYTES} bytes")
         return parse_toml(content)
+
+
+def read_text(path: str | Path, longest_bytes: int | None = None) -> str:
+    """A text in UTF-8, with or without a byte order mark; errors as of :func:`read_toml`."""
+    with reading(path, "a text in UTF-8"), open_regular(path) as file:
+        content = file.read() if longest_bytes is None else file.read(longest_bytes + 1)
+        if longest_bytes is not None and len(content) > longest_bytes:
+            raise ValueError(f"more than {longest_bytes} bytes")
+        return content.decode("utf-8-sig")
+
+
+def read_json(path: str | Path) -> Any:
+    """The content of a JSON file; errors as of :func:`read_toml`."""
+    text = read_text(path)
+    with reading(path, "a JSON file"):
+        return json.loads(text)
+
+
+def read_yaml(path: str | Path) -> Any:
+    """The content of a YAML file of at most :data:`LONGEST_YAML_BYTES`, also of OpenCV's; errors as of :func:`read_toml`.
+
+    What a tag such as ``!!opencv-matrix`` stands before is read as if it had none.
+    """
+    text = read_text(path, LONGEST_YAML_BYTES)
+    with reading(path, "a YAML file"):
+        return yaml.load(_YAML_HEADER.sub("", text), _PlainLoader)
+
+
+def read_xml(path: str | Path) -> ElementTree.Element:
+    """The root of an XML file of at most :data:`LONGEST_XML_BYTES` without entities; errors as of :func:`read_toml`."""
+    text = read_text(path, LONGEST_XML_BYTES)
+    with reading(path, "an XML file without a document type"):
+        if "<!DOCTYPE" in text or "<!ENTITY" in text:
+            raise ValueError("a document type, which may let the file grow without bounds")
+        return ElementTree.fromstring(text.encode())
+
+
+def read_rows(path: str | Path) -> list[list[str]]:
+    """The rows of a CSV file, separated by commas, semicolons or tabs, without empty ones; errors as of :func:`read_toml`."""
+    text = read_text(path)
+    with reading(path, "a table (.csv)"):
+        first, _, _ = text.partition("\n")
+        delimiter = max(",;\t", key=first.count)
+        return [row for row in csv.reader(io.StringIO(text, newline=""), delimiter=delimiter, strict=True) if any(row)]
+
+
+def read_array(path: str | Path) -> NDArray[Any]:
+    """The array of an ``.npy`` file; errors as of :func:`read_toml`."""
+    with reading(path, "an array of numbers or texts (.npy)"), open_regular(path) as file:
+        _check_header("of the file", file, os.fstat(file.fileno()).st_size)
+        file.seek(0)
+        array = np.lib.format.read_array(file, allow_pickle=False)
+        return array.astype(array.dtype.newbyteorder("="), copy=False)
+
+
+@contextmanager
+def open_h5(path: str | Path) -> Iterator[H5File]:
+    """An HDF5 file. Use it within :func:`reading`: looking up a part of a damaged file raises anything.
+
+    Raises:
+        FileFormatError: if h5py is not installed.
+        FileNotFoundError: if there is no such file.
+    """
+    try:
+        import h5py
+    except ImportError as error:
+        raise FileFormatError(
+            "a file needs a package that is not installed",
+            where=str(path),
+            got="an HDF5 file (.h5), and no package h5py",
+            expected="the package h5py",
+            remedy="Install it with `pip install h5py`, or save the file as .csv.",
+        ) from error
+    with open_regular(path) as file, h5py.File(file, "r") as content:
+        yield H5File(content, GROWTH * os.fstat(file.fileno()).st_size + SLACK_BYTES)
+
+
+def h5_can_be_read() -> bool:
+    """Whether h5py, which reads HDF5 files, is installed."""
+    return importlib.util.find_spec("h5py") is not None
+
+
+class H5File:
+    """The datasets and attributes of an HDF5 file, read when they are asked for.
+
+    Datasets that are in another file, or in several, are not read. All together may have :data:`GROWTH` times the size of the
+    file and :data:`SLACK_BYTES`.
+    """
+
+    def __init__(self, content: Any, budget_bytes: int) -> None:
+        self._content = content
+        self._left_bytes = budget_bytes
+
+    def __contains__(self, name: str) -> bool:
+        return self._found(name) is not None
+
+    def groups(self) -> list[str]:
+        """The names of what stands at the top of the file."""
+        return list(self._content)
+
+    def array(self, name: str) -> NDArray[Any]:
+        """A dataset of numbers, texts or records of these.
+
+        Raises:
+            KeyError: if there is none of this name in the file itself.
+            ValueError: if it holds something else, or is too large.
+        """
+        dataset = self._found(name)
+        if dataset is None or not hasattr(dataset, "dtype"):
+            raise KeyError(name)
+        if dataset.external or dataset.is_virtual:
+            raise ValueError(f"dataset {name!r} is in another file")
+        import h5py
+
+        text = h5py.check_string_dtype(dataset.dtype) is not None
+        kinds = {dataset.dtype[field].base.kind for field in dataset.dtype.names or ()} or {dataset.dtype.kind}
+        if not (text or kinds <= {*_KINDS, "S"}):
+            raise ValueError(f"dataset {name!r} is of the type {dataset.dtype}, not of numbers or texts")
+        self._left_bytes -= dataset.size * dataset.dtype.itemsize
+        if self._left_bytes < 0:
+            raise ValueError(f"dataset {name!r} of the shape {dataset.shape}: more than {GROWTH} times the size of the file")
+        return dataset[()]
+
+    def texts(self, name: str) -> list[str]:
+        """A dataset of texts; errors as of :meth:`array`."""
+        return [
+            value.decode() if isinstance(value, bytes) else str(value) for value in np.atleast_1d(self.array(name)).tolist()
+        ]
+
+    def attribute(self, name: str, key: str) -> Any:
+        """An attribute of a dataset or a group.
+
+        Raises:
+            KeyError: if there is none.
+        """
+        owner = self._found(name)
+        if owner is None:
+            raise KeyError(name)
+        return owner.attrs[key]
+
+    def _found(self, name: str) -> Any:
+        """What has a path of names, if it and all above it are in this file."""
+        import h5py
+
+        owner = self._content
+        for part in name.split("/"):
+            if not isinstance(owner, h5py.Group) or not isinstance(owner.get(part, getlink=True), h5py.HardLink):
+                return None
+            owner = owner[part]
+        return owner
+
+
+class _PlainLoader(yaml.SafeLoader):
+    """YAML as lists, dictionaries, numbers and texts, whatever tags it has. Aliases, by which a file may grow, are refused."""
+
+    def compose_node(self, parent: yaml.Node | None, index: int) -> yaml.Node | None:
+        if self.check_event(yaml.AliasEvent):
+            raise ValueError("an alias (*name) for another part of the file")
+        return super().compose_node(parent, index)
+
+
+def _untagged(loader: _PlainLoader, _: str, node: yaml.Node) -> Any:
+    if isinstance(node, yaml.MappingNode):
+        return loader.construct_mapping(node, deep=True)
+    if isinstance(node, yaml.SequenceNode):
+        return loader.construct_sequence(node, deep=True)
+    assert isinstance(node, yaml.ScalarNode)
+    return loader.construct_scalar(node)
+
+
+_PlainLoader.add_multi_constructor("tag:yaml.org,2002:opencv-", _untagged)
 
 
 @contextmanager

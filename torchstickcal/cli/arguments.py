@@ -40,9 +40,12 @@ def parser() -> argparse.ArgumentParser:
 
 def _add_calibrate(commands: Any) -> None:
     command = commands.add_parser("calibrate", help="calibrate a session", description="Calibrate a session.")
-    command.add_argument("session", metavar="SESSION", type=_path, help="file or folder of a session")
+    command.add_argument(
+        "session", metavar="SESSION", type=_path, nargs="+", help="file or folder of a session; or one file for each camera"
+    )
     _add_out(command, "results")
     _add_format(command, "SESSION")
+    _add_given(command)
     _add_config(command)
     command.add_argument(
         "--refine",
@@ -78,6 +81,11 @@ def _add_evaluate(commands: Any) -> None:
     )
     _add_format(command, "TRUTH, if it is a session")
     command.add_argument("--json", metavar="FILE", type=_path, help="write the errors as JSON")
+    command.add_argument(
+        "--units",
+        choices=("m", "cm", "mm"),
+        help="unit of length of a calibration file that does not say it (aniposelib, COLMAP)",
+    )
     _add_plugin(command)
     command.set_defaults(run=evaluate)
 
@@ -162,6 +170,33 @@ def _add_config(command: argparse.ArgumentParser) -> None:
 def _add_format(command: argparse.ArgumentParser, what: str) -> None:
     help = f"format of {what}: name from `torchstickcal list formats` (default: recognised by the content)"
     command.add_argument("--format", metavar="NAME", help=help)
+
+
+def _add_given(command: argparse.ArgumentParser) -> None:
+    """What the files of a detector do not say."""
+    add = command.add_argument
+    add(
+        "--stick",
+        metavar=("START", "END", "METRES"),
+        nargs=3,
+        action="append",
+        help="a stick: two points and the metres between them; may be given several times (default: the session's)",
+    )
+    add(
+        "--stick-points", metavar="PATH", type=_path, help="keypoints of the stick's ends, where they are in files of their own"
+    )
+    add(
+        "--intrinsics", metavar="FILE", type=_path, help="calibration of which the intrinsics are used (default: the session's)"
+    )
+    add("--image-size", metavar=("WIDTH", "HEIGHT"), type=float, nargs=2, help="size of the images, pixels")
+    add("--fps", metavar="HZ", type=float, help="frames per second")
+    add("--skeleton", metavar="NAME|FILE.toml", help="names of the points (default: by their number)")
+    add(
+        "--person",
+        metavar="largest|central|moving|stick|N",
+        default="auto",
+        help="who the athlete is, of several people (default: who is nearest to the stick of --stick-points, else the largest)",
+    )
 
 
 def _add_plugin(command: argparse.ArgumentParser) -> None:

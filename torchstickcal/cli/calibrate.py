@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import sys
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -13,6 +14,7 @@ from torchstickcal.errors import CalibrationError
 
 if TYPE_CHECKING:
     from torchstickcal.config import Config
+    from torchstickcal.io import Given
     from torchstickcal.observations import Observations
     from torchstickcal.pipeline.calibrate import Callback
     from torchstickcal.result import Calibration
@@ -22,7 +24,7 @@ if TYPE_CHECKING:
 def calibrate_session(options: argparse.Namespace) -> int:
     from torchstickcal.config import load_config
     from torchstickcal.files import atomic_set, try_writing
-    from torchstickcal.io import read_session
+    from torchstickcal.io import load_session
     from torchstickcal.pipeline.calibrate import calibrate
 
     config, refine = _refining(load_config(options.config), options.refine, options.no_sync)
@@ -30,12 +32,57 @@ def calibrate_session(options: argparse.Namespace) -> int:
     try_writing(options.out, result_names(writers))
     if options.tensorboard is not None:
         try_writing(options.tensorboard, where="--tensorboard")
-    observations, _ = read_session(options.session, options.format)
-    observations = _with_stick(observations, options.stick_length, options.stick_sigma)
+    session = load_session(options.session, options.format, _given(options))
+    for note in session.notes:
+        print(f"note: {note}", file=sys.stderr)
+    observations = _with_stick(session.observations, options.stick_length, options.stick_sigma)
     calibration = calibrate(observations, config, Progress(_monitor(options.tensorboard)), refine)
     with atomic_set(options.out) as folder:
-        write_results(calibration, folder, writers, {"session": str(options.session), "config": options.config})
+        write_results(calibration, folder, writers, _provenance(options, session.notes))
     return show_results(calibration, options.out, writers)
+
+
+def _given(options: argparse.Namespace) -> Given:
+    """What the options say of a recording.
+
+    Raises:
+        CalibrationError: if a stick has no length, or a file of the stick's ends cannot be read.
+    """
+    from torchstickcal.io import Given, read_recording
+    from torchstickcal.stick import Stick
+
+    sticks = [Stick(_end(start), _end(end), _metres(length)) for start, end, length in options.stick or ()]
+    return Given(
+        stick=sticks or None,
+        intrinsics=options.intrinsics,
+        image_size=options.image_size,
+        fps=options.fps,
+        skeleton=options.skeleton,
+        person=options.person,
+        stick_points=None if options.stick_points is None else read_recording(options.stick_points),
+    )
+
+
+def _end(text: str) -> int | str:
+    """A stick's end: the index or the name of a point."""
+    return int(text) if text.isascii() and text.isdecimal() else text
+
+
+def _metres(text: str) -> float:
+    try:
+        return float(text)
+    except ValueError as error:
+        raise CalibrationError(
+            "not a length", where="--stick", got=repr(text), expected="START END METRES, such as knob barrel 0.864"
+        ) from error
+
+
+def _provenance(options: argparse.Namespace, notes: Sequence[str]) -> dict[str, Any]:
+    return {
+        "session": ", ".join(map(str, options.session)),
+        "config": options.config,
+        **({"notes": list(notes)} if notes else {}),
+    }
 
 
 def _refining(config: Config, option: str | None, no_sync: bool) -> tuple[Config, Any]:

@@ -19,8 +19,8 @@ def evaluate(options: argparse.Namespace) -> int:
     from torchstickcal.metrics import pose_errors
 
     try_json(options.json)
-    names, estimate = _poses(options.calibration, None)
-    truth_names, truth = _poses(options.truth, options.format)
+    names, estimate = _poses(options.calibration, None, options.units)
+    truth_names, truth = _poses(options.truth, options.format, options.units)
     if len(names) != len(truth_names):
         raise CalibrationError(
             "the number of cameras differs",
@@ -38,22 +38,24 @@ def evaluate(options: argparse.Namespace) -> int:
     return EXIT_DONE
 
 
-def _poses(path: Path, format: str | None) -> tuple[tuple[str, ...], Truth]:
+def _poses(path: Path, format: str | None, units: str | None) -> tuple[tuple[str, ...], Truth]:
     """Names and poses of the cameras of a calibration, or of a session that holds its truth.
 
     Args:
         path: a file, or a folder that holds a camera file.
         format: of the session; None if the content decides.
+        units: of length, of a calibration that does not say it.
     """
     from torchstickcal.errors import FileFormatError
-    from torchstickcal.io import CALIBRATION_READERS, SESSION_READERS, Rig, Truth, find_reader
+    from torchstickcal.io import CALIBRATION_READERS, SESSION_READERS, Rig, Truth, find_reader, reading
 
     if format is None and (path / CAMERAS_FILE).is_file():
         path = path / CAMERAS_FILE
     reader = SESSION_READERS[format] if format else find_reader(path, CALIBRATION_READERS, SESSION_READERS)
     content = reader.read(path)
     if isinstance(content, Rig):
-        return content.names, Truth(content.rotations, content.translations)
+        with reading(path, "a calibration with poses in a known unit"):
+            return content.names, Truth(*content.poses(units if content.unit is None else None))
     observations, truth = content
     if truth is None:
         raise FileFormatError("a session without truth", where=str(path), got="no poses", expected="the poses of its cameras")

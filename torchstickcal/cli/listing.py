@@ -38,10 +38,12 @@ def _unknowns() -> Iterator[tuple[str, str]]:
 
 
 def _formats() -> Iterator[tuple[str, str]]:
-    from torchstickcal.io import CALIBRATION_READERS, CALIBRATION_WRITERS, SESSION_READERS
+    from torchstickcal.io import CALIBRATION_READERS, CALIBRATION_WRITERS, KEYPOINT_READERS, SESSION_READERS
 
     for name, reader in SESSION_READERS.items():
         yield name, f"reads sessions: {reader.description}"
+    for name, reader in KEYPOINT_READERS.items():
+        yield name, f"reads keypoints: {reader.description}"
     for name, reader in CALIBRATION_READERS.items():
         yield name, f"reads calibrations: {reader.description}"
     for name, writer in CALIBRATION_WRITERS.items():
@@ -89,7 +91,7 @@ def _configs() -> Iterator[tuple[str, str]]:
 LISTS: dict[str, tuple[str, Callable[[], Iterator[tuple[str, str]]]]] = {
     "losses": ("keys in the table of a stage of a configuration", _losses),
     "unknowns": ("for --refine, and the key `refine` of a configuration", _unknowns),
-    "formats": ("files that can be read (--format takes those of sessions) and written (--export)", _formats),
+    "formats": ("files that can be read (--format takes those of sessions and keypoints) and written (--export)", _formats),
     "sports": ("for simulate", _sports),
     "presets": ("sets of sessions, for simulate and benchmark", _presets),
     "baselines": ("other methods of calibration, for benchmark --methods", _baselines),

@@ -44,7 +44,7 @@ def result_names(writers: dict[str, Writer]) -> list[str]:
     return [*writers, POINTS_FILE, REPORT_FILE]
 
 
-def write_results(calibration: Calibration, folder: Path, writers: dict[str, Writer], provenance: dict[str, str]) -> None:
+def write_results(calibration: Calibration, folder: Path, writers: dict[str, Writer], provenance: dict[str, Any]) -> None:
     """Write the results of a calibration into a folder of :func:`torchstickcal.files.atomic_set`."""
     from torchstickcal.show.report import summary
 

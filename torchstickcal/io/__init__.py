@@ -1,4 +1,4 @@
-"""Files: sessions and calibrations are read, and calibrations are written, in formats that are found by name.
+"""Files: sessions, detectors' keypoints and calibrations are read, and calibrations are written, in formats found by name.
 
 Example:
     >>> from torchstickcal.io import CALIBRATION_READERS, CALIBRATION_WRITERS, SESSION_READERS
@@ -10,43 +10,64 @@ from torchstickcal.io.camera_toml import read_camera_toml, write_camera_toml
 from torchstickcal.io.formats import (
     CALIBRATION_READERS,
     CALIBRATION_WRITERS,
+    KEYPOINT_READERS,
     SESSION_READERS,
     Reader,
     Session,
     Writer,
     calibration_reader,
     calibration_writer,
+    camera_reader,
     find_reader,
+    keypoint_reader,
     read_calibration,
-    read_session,
     reading,
     session_reader,
     write_calibration,
 )
+from torchstickcal.io.given import Given, complete
+from torchstickcal.io.movement import recording_of_movement
 from torchstickcal.io.npz import read_npz, write_npz
-from torchstickcal.io.rig import Rig
+from torchstickcal.io.recording import Detection, Recording, View
+from torchstickcal.io.rig import Rig, RigCamera
+from torchstickcal.io.sessions import LoadedSession, load_session, read_recording, read_session
+from torchstickcal.io.skeletons import SKELETONS
 from torchstickcal.io.sports_stick_syn import SPORTS_STICK_SYN_JOINTS, read_sports_stick_syn
 from torchstickcal.io.truth import Truth
 
 __all__ = [
     "CALIBRATION_READERS",
     "CALIBRATION_WRITERS",
+    "KEYPOINT_READERS",
     "SESSION_READERS",
+    "SKELETONS",
     "SPORTS_STICK_SYN_JOINTS",
+    "Detection",
+    "Given",
+    "LoadedSession",
     "Reader",
+    "Recording",
     "Rig",
+    "RigCamera",
     "Session",
     "Truth",
+    "View",
     "Writer",
     "calibration_reader",
     "calibration_writer",
+    "camera_reader",
+    "complete",
     "find_reader",
+    "keypoint_reader",
+    "load_session",
     "read_calibration",
     "read_camera_toml",
     "read_npz",
+    "read_recording",
     "read_session",
     "read_sports_stick_syn",
     "reading",
+    "recording_of_movement",
     "session_reader",
     "write_calibration",
     "write_camera_toml",

@@ -1,6 +1,7 @@
-"""Calibration files of Pose2Sim and aniposelib (``calibration.toml``).
+"""Calibration files of Pose2Sim, aniposelib and FreeMoCap (``calibration.toml``).
 
-One table per camera: world to camera, rotation vectors, metres. Both programs take every top-level table other than
+One table per camera: world to camera, rotation vectors; metres in files of Pose2Sim and of this library, millimetres in those
+of FreeMoCap, and a unit that the file does not say in those of aniposelib. Both programs take every top-level table other than
 ``metadata`` for a camera. aniposelib sorts the names of the tables as text, so their numbers are written with leading zeros.
 """
 
@@ -12,22 +13,23 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 import cv2
-import numpy as np
 import torch
 from torch import Tensor
 
 from torchstickcal.files import atomic_path, check_text
 from torchstickcal.io.formats import calibration_reader, calibration_writer, reading
-from torchstickcal.io.rig import Rig, as_float64, check_finite
+from torchstickcal.io.rig import METRES, Rig, RigCamera, as_float64
 from torchstickcal.result import Calibration
 from torchstickcal.shapes import check_shapes
 from torchstickcal.untrusted import read_toml
 
 _NAME = "pose2sim"
-_DESCRIPTION = "cameras of Pose2Sim or aniposelib, in metres (.toml)"
+_DESCRIPTION = "cameras of Pose2Sim, aniposelib, Anipose or FreeMoCap (.toml)"
 _NOT_CAMERAS = {"metadata", "capture_volume", "charuco", "checkerboard"}
 _CAMERA_TABLE = re.compile(rb"^(?:\xef\xbb\xbf)?\[[^\[\].]+\]\s*\n(?:(?!\[).*\n)*?matrix\s*=", re.MULTILINE)
 """A top-level table with a camera matrix."""
+_COEFFICIENTS = 4
+"""Number of distortion coefficients that Pose2Sim writes."""
 _Value = TypeVar("_Value")
 
 
@@ -69,7 +71,7 @@ def write_camera_toml(path: str | Path, calibration: Calibration) -> None:
 
 @calibration_reader(_NAME, _DESCRIPTION, recognises=lambda path, head: _CAMERA_TABLE.search(head) is not None)
 def read_camera_toml(path: str | Path) -> Rig:
-    """Read a calibration file of Pose2Sim or aniposelib.
+    """Read a calibration file of Pose2Sim, aniposelib or FreeMoCap.
 
     Args:
         path: of the file.
@@ -97,25 +99,50 @@ def read_camera_toml(path: str | Path) -> Rig:
         ...     path = pathlib.Path(folder, "calibration.toml")
         ...     _ = path.write_text(text)
         ...     rig = read_camera_toml(path)
-        >>> rig.names, rig.translations.tolist()
-        (('left',), [[0.0, 0.0, 2.5]])
+        >>> rig.names, rig.translations.tolist(), rig.unit
+        (('left',), [[0.0, 0.0, 2.5]], None)
     """
     with reading(path, _DESCRIPTION):
-        cameras = {key: table for key, table in read_toml(path).items() if key not in _NOT_CAMERAS}
+        content = read_toml(path)
+        cameras = {key: table for key, table in content.items() if key not in _NOT_CAMERAS}
         if not cameras:
             raise KeyError("table of a camera")
-        vectors = _stacked(cameras, "rotation")
-        check_shapes("cameras", {"rotation": vectors}, {"rotation": "C 3"})
-        check_finite("cameras", {"rotation": vectors})
-        return Rig(
-            names=tuple(_given(camera, "name", str, key) for key, camera in cameras.items()),
-            intrinsics=_stacked(cameras, "matrix"),
-            distortion=tuple(as_float64("distortions", camera["distortions"]) for camera in cameras.values()),
-            fisheye=tuple(_given(camera, "fisheye", bool, False) for camera in cameras.values()),
-            image_size=_stacked(cameras, "size"),
-            rotations=torch.from_numpy(np.stack([cv2.Rodrigues(vector.numpy())[0] for vector in vectors])),
-            translations=_stacked(cameras, "translation"),
-        )
+        return Rig.of([_rig_camera(key, table) for key, table in cameras.items()], _unit(cameras, content.get("metadata", {})))
+
+
+def _rig_camera(key: str, table: dict[str, Any]) -> RigCamera:
+    posed = "rotation" in table or "translation" in table
+    return RigCamera(
+        name=_given(table, "name", str, key),
+        matrix=table["matrix"],
+        distortion=_vector(table, "distortions"),
+        fisheye=_given(table, "fisheye", bool, False),
+        image_size=table["size"],
+        rotation=_vector(table, "rotation") if posed else None,
+        translation=table["translation"] if posed else None,
+    )
+
+
+def _vector(table: dict[str, Any], key: str) -> Tensor:
+    """A list of numbers of a camera's table; rotations are vectors in these files."""
+    vector = as_float64(key, table[key])
+    check_shapes(key, {key: vector}, {key: "3" if key == "rotation" else "D"})
+    return vector
+
+
+def _unit(cameras: dict[str, Any], metadata: dict[str, Any]) -> str | None:
+    """The unit of length: as the file says, else that of the program that wrote it.
+
+    FreeMoCap writes millimetres and ``world_position``; Pose2Sim writes metres, ``fisheye`` and no more than 4 coefficients.
+    aniposelib writes whatever unit its board was measured in.
+    """
+    said = metadata.get("units")
+    if said in METRES:
+        return str(said)
+    if any("world_position" in table for table in cameras.values()):
+        return "mm"
+    pose2sim = all("fisheye" in table and len(table["distortions"]) == _COEFFICIENTS for table in cameras.values())
+    return "m" if pose2sim else None
 
 
 def _camera(calibration: Calibration, index: int) -> str:
@@ -144,10 +171,6 @@ def _distortion(calibration: Calibration, index: int) -> Tensor:
 def _metadata(calibration: Calibration) -> str:
     error = float(calibration.reprojection_median_px.mean())
     return f'[metadata]\nadjusted = false\nerror = {error!r}\nunits = "m"\ngenerator = "torchstickcal"\n'
-
-
-def _stacked(cameras: dict[str, Any], key: str) -> Tensor:
-    return torch.tensor([camera[key] for camera in cameras.values()], dtype=torch.float64)
 
 
 def _given(camera: dict[str, Any], key: str, kind: type[_Value], default: _Value) -> _Value:

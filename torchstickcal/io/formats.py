@@ -1,11 +1,12 @@
-"""File formats by name: readers of sessions, readers of calibrations, writers of calibrations.
+"""File formats by name: readers of sessions, of detectors' keypoints and of calibrations, writers of calibrations.
 
-A new format is one decorated function, in a file of this folder or in a module of your own. :func:`read_session`,
-:func:`read_calibration`, :func:`write_calibration` and the command line then know it.
+A new format is one decorated function, in a file of this folder or in a module of your own.
+:func:`~torchstickcal.io.read_session`, :func:`read_calibration`, :func:`write_calibration` and the command line then know it.
 """
 
 from __future__ import annotations
 
+import functools
 import os
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -14,6 +15,7 @@ from typing import Any, Generic, TypeVar
 
 from torchstickcal.errors import CalibrationError, FileFormatError
 from torchstickcal.files import check_text
+from torchstickcal.io.recording import Recording, View, in_folder
 from torchstickcal.io.rig import Rig
 from torchstickcal.io.truth import Truth
 from torchstickcal.observations import Observations
@@ -23,6 +25,9 @@ from torchstickcal.untrusted import read_head, reading
 
 HEAD_BYTES = 4096
 """Number of bytes from the beginning of a file that a recogniser is given."""
+
+_FIRST_ENTRIES = 50
+"""Number of entries of a folder among which one is looked for by which the folder is recognised."""
 
 Session = tuple[Observations, Truth | None]
 """What a session reader returns: the observations, and the truth if the file holds it."""
@@ -62,7 +67,7 @@ class Reader(Generic[_Content]):
                     "a reader returns something else than it should",
                     where=f"{self.function.__module__}.{self.function.__name__}",
                     got=type(content).__name__,
-                    expected="for a session (Observations, Truth or None), for a calibration a Rig",
+                    expected="for a session (Observations, Truth or None), for keypoints a Recording, for a calibration a Rig",
                 )
             return content
 
@@ -111,6 +116,9 @@ class Writer:
 SESSION_READERS: Registry[Reader[Session]] = Registry("session format", "torchstickcal.io")
 """The formats of sessions that can be read, by name. :func:`session_reader` adds one."""
 
+KEYPOINT_READERS: Registry[Reader[Recording]] = Registry("session format", "torchstickcal.io")
+"""The formats of detectors' keypoints that can be read, by name. :func:`keypoint_reader` and :func:`camera_reader` add one."""
+
 CALIBRATION_READERS: Registry[Reader[Rig]] = Registry("calibration format", "torchstickcal.io")
 """The formats of calibrations that can be read, by name. :func:`calibration_reader` adds one."""
 
@@ -118,6 +126,8 @@ CALIBRATION_WRITERS: Registry[Writer] = Registry("output format", "torchstickcal
 """The formats in which a calibration can be written, by name. :func:`calibration_writer` adds one."""
 
 _SessionFunction = TypeVar("_SessionFunction", bound=Callable[[Path], Session])
+_RecordingFunction = TypeVar("_RecordingFunction", bound=Callable[[Path], Recording])
+_ViewFunction = TypeVar("_ViewFunction", bound=Callable[[Path], View])
 _RigFunction = TypeVar("_RigFunction", bound=Callable[[Path], Rig])
 _WriterFunction = TypeVar("_WriterFunction", bound=Callable[[Path, Calibration], None])
 
@@ -155,6 +165,93 @@ def session_reader(
 
     def register(function: _SessionFunction) -> _SessionFunction:
         SESSION_READERS.register(name, Reader(function, recognises, description, _is_session), replace=replace)
+        return function
+
+    return register
+
+
+def keypoint_reader(
+    name: str, description: str, *, recognises: Callable[[Path, bytes], bool], replace: bool = False
+) -> Callable[[_RecordingFunction], _RecordingFunction]:
+    """A decorator that registers a function as the reader of keypoints of all cameras, and returns the function unchanged.
+
+    The function is called with a path and returns the :class:`~torchstickcal.io.Recording`. Any exception that it raises
+    becomes a :class:`~torchstickcal.FileFormatError` that names the file.
+
+    Args:
+        name: of the format.
+        description: the format in one line.
+        recognises: whether a path is of this format, as for :class:`Reader`.
+        replace: whether to replace a format of that name.
+
+    Raises:
+        ConfigError: if the name is in use.
+
+    Example::
+
+        import json
+        import numpy as np
+        from torchstickcal.io import Recording, View, keypoint_reader
+
+        @keypoint_reader("tiny", "tracks (F, P, 2) of each camera as JSON", recognises=lambda path, head: b'"tiny"' in head)
+        def read_tiny(path):
+            cameras = json.loads(path.read_text())["tiny"]
+            return Recording.of([View.of_tracks(name, np.array(tracks)[None]) for name, tracks in cameras.items()])
+    """
+
+    def register(function: _RecordingFunction) -> _RecordingFunction:
+        KEYPOINT_READERS.register(name, Reader(function, recognises, description, _is_recording), replace=replace)
+        return function
+
+    return register
+
+
+def camera_reader(
+    name: str, description: str, *, recognises: Callable[[Path, bytes], bool], replace: bool = False
+) -> Callable[[_ViewFunction], _ViewFunction]:
+    """A decorator that registers a function as the reader of keypoints of one camera, and returns the function unchanged.
+
+    What is read is one file (or folder) of a camera, or a folder with one of them for each camera. The function is called with
+    the path of one camera and returns its :class:`~torchstickcal.io.View`. Any exception that it raises becomes a
+    :class:`~torchstickcal.FileFormatError` that names the file.
+
+    Args:
+        name: of the format.
+        description: the format in one line.
+        recognises: whether a path is that of one camera in this format, as for :class:`Reader`.
+        replace: whether to replace a format of that name.
+
+    Raises:
+        ConfigError: if the name is in use.
+
+    Example::
+
+        import numpy as np
+        from torchstickcal.io import View, camera_reader
+
+        @camera_reader("words", "a line of numbers for each frame", recognises=lambda path, head: head.startswith(b"words"))
+        def read_words(path):
+            rows = [list(map(float, line.split())) for line in path.read_text().splitlines()[1:]]
+            return View.of_tracks(path.stem, np.array(rows).reshape(1, len(rows), -1, 2))
+    """
+
+    def register(function: _ViewFunction) -> _ViewFunction:
+        @functools.wraps(function)
+        def read(path: Path) -> Recording:
+            cameras, others = _cameras_of(path, recognises)
+            if not cameras:
+                cameras, others = [path], []  # the format is forced: the function says what is wrong
+            views = []
+            for camera in cameras:
+                with reading(camera, description):
+                    views.append(function(camera))
+            ignored = f"Not read in {path}: {', '.join(others[:3])}{', ...' if len(others) > 3 else ''}."
+            return Recording.of(views).with_notes(*([ignored] if others else []))
+
+        def takes(path: Path, head: bytes) -> bool:
+            return recognises(path, head) or bool(_cameras_of(path, recognises, first=_FIRST_ENTRIES)[0])
+
+        KEYPOINT_READERS.register(name, Reader(read, takes, description, _is_recording), replace=replace)
         return function
 
     return register
@@ -240,36 +337,6 @@ def calibration_writer(
     return register
 
 
-def read_session(path: str | Path, format: str | None = None) -> Session:
-    """Read a session: keypoints, intrinsics, sticks, and the truth if the file holds it.
-
-    Args:
-        path: of the file or the folder.
-        format: name of its format, a key of :data:`SESSION_READERS`; None to recognise it by its content.
-
-    Returns:
-        The observations, and the truth or None.
-
-    Raises:
-        FileFormatError: if no format is recognised, or if the file is damaged or cannot be opened.
-        ConfigError: for an unknown format.
-        ObservationError: if the session cannot be used for a calibration.
-        FileNotFoundError: if there is no such file.
-
-    Example:
-        >>> import tempfile
-        >>> from torchstickcal.io import read_session, write_npz
-        >>> from torchstickcal.simulate import golf_session
-        >>> with tempfile.TemporaryDirectory() as folder:
-        ...     write_npz(f"{folder}/swing.npz", *golf_session(cameras=3, frames=10))
-        ...     observations, truth = read_session(f"{folder}/swing.npz")
-        >>> observations.keypoints.shape, truth.rotations.shape
-        (torch.Size([3, 10, 21, 2]), torch.Size([3, 3, 3]))
-    """
-    reader: Reader[Session] = find_reader(path, SESSION_READERS) if format is None else SESSION_READERS[format]
-    return reader.read(path)
-
-
 def read_calibration(path: str | Path, format: str | None = None) -> Rig:
     """Read the cameras of a calibration.
 
@@ -341,20 +408,34 @@ def find_reader(path: str | Path, *registries: Registry[Any]) -> Reader[Any]:
         'read_npz'
     """
     path = Path(path)
-    is_folder = os.path.isdir(path)  # noqa: PTH112 Path.is_dir raises for names that are too long
-    head = b"" if is_folder else read_head(path, HEAD_BYTES)
+    head = head_of(path)
     for registry in registries:
         for reader in reversed(tuple(registry.values())):
             if reader.takes(path, head):
                 return reader
     known = (f"{name} = {reader.description}" for registry in registries for name, reader in registry.items())
     raise FileFormatError(
-        f"no {' or '.join(registry.kind for registry in registries)} is recognised",
+        f"no {' or '.join(dict.fromkeys(registry.kind for registry in registries))} is recognised",
         where=str(path),
-        got="a folder" if is_folder else f"a file that starts with {head[:16]!r}" if head else "an empty file",
+        got="a folder" if is_folder(path) else f"a file that starts with {head[:16]!r}" if head else "an empty file",
         expected=f"one of: {'; '.join(known)}",
         remedy="If it is one of these, give the name of the format.",
     )
+
+
+def is_folder(path: Path) -> bool:
+    """Whether a path is that of a folder, whatever its name is."""
+    return os.path.isdir(path)  # noqa: PTH112 Path.is_dir raises for names that are too long
+
+
+def head_of(path: Path) -> bytes:
+    """What a recogniser is given of a path: the first :data:`HEAD_BYTES` bytes of a file, none of a folder.
+
+    Raises:
+        FileFormatError: if it cannot be opened.
+        FileNotFoundError: if there is no such file.
+    """
+    return b"" if is_folder(path) else read_head(path, HEAD_BYTES)
 
 
 def session_of(observations: Observations, truth: Truth | None) -> Session:
@@ -379,6 +460,34 @@ def _is_session(content: object) -> bool:
         return False
     session_of(observations, truth)
     return True
+
+
+def _cameras_of(
+    path: Path, recognises: Callable[[Path, bytes], bool], first: int | None = None
+) -> tuple[list[Path], list[str]]:
+    """The paths of the cameras, which a path is or holds, and the names of what else it holds.
+
+    Args:
+        path: of one camera, or of a folder.
+        recognises: whether a path is that of one camera.
+        first: how many entries of the folder are looked at; None for all.
+    """
+
+    def is_camera(entry: Path) -> bool:
+        try:
+            return recognises(entry, head_of(entry))
+        except Exception:
+            return False
+
+    if is_camera(path):
+        return [path], []
+    entries = in_folder(path)[:first] if is_folder(path) else []
+    cameras = [entry for entry in entries if is_camera(entry)]
+    return cameras, [entry.name for entry in entries if entry not in cameras]
+
+
+def _is_recording(content: object) -> bool:
+    return isinstance(content, Recording)
 
 
 def _is_rig(content: object) -> bool:

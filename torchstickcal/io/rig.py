@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
+import cv2
 import numpy as np
 import torch
 from torch import Tensor
@@ -14,6 +16,27 @@ from torchstickcal.shapes import check_shapes
 
 _ROTATION_TOLERANCE = 1e-3
 """Largest entry of ``R R^T - 1`` of a rotation: files may give rotations with three or four digits."""
+
+METRES = {"m": 1.0, "cm": 0.01, "mm": 0.001}
+"""The units of length that a file may have, in metres."""
+
+
+@dataclass(frozen=True, eq=False)
+class RigCamera:
+    """One camera of a calibration file, as files give it: arrays or lists of numbers."""
+
+    name: str
+    matrix: Any
+    """(3, 3)"""
+    distortion: Any = ()
+    """coefficients in OpenCV's order, in any shape"""
+    fisheye: bool = False
+    image_size: Any = None
+    """width and height; None if they are not known"""
+    rotation: Any = None
+    """a rotation vector (3,) or matrix (3, 3), world to camera; None if the pose is not known"""
+    translation: Any = None
+    """(3,), world to camera"""
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,12 +57,69 @@ class Rig:
     """C vectors of distortion coefficients, in OpenCV's order"""
     fisheye: tuple[bool, ...]
     """for each camera, whether its coefficients are those of OpenCV's fisheye model"""
-    image_size: Tensor
-    """(C, 2), width and height, pixels"""
-    rotations: Tensor
-    """(C, 3, 3), world to camera"""
-    translations: Tensor
-    """(C, 3), world to camera, metres"""
+    image_size: Tensor | None = None
+    """(C, 2), width and height, pixels; NaN or None where they are not known"""
+    rotations: Tensor | None = None
+    """(C, 3, 3), world to camera; None if the poses of some cameras are not known"""
+    translations: Tensor | None = None
+    """(C, 3), world to camera, in metres unless ``unit`` is None"""
+    unit: str | None = "m"
+    """unit of length in the file; None if neither the file nor its format says which it is"""
+
+    @classmethod
+    def of(cls, cameras: Sequence[RigCamera], unit: str | None = "m") -> Rig:
+        """The rig of some cameras, whose translations are in a unit of :data:`METRES`, or in one that is not known (None).
+
+        Raises:
+            CalibrationError: as for :class:`Rig`.
+
+        Example:
+            >>> matrix = [[500, 0, 320], [0, 500, 240], [0, 0, 1]]
+            >>> rig = Rig.of([RigCamera("left", matrix, rotation=[0, 0, 0], translation=[0, 0, 2500])], "mm")
+            >>> rig.translations, rig.image_size
+            (tensor([[0.0000, 0.0000, 2.5000]], dtype=torch.float64), tensor([[nan, nan]], dtype=torch.float64))
+        """
+        posed = all(camera.rotation is not None and camera.translation is not None for camera in cameras)
+        sizes = [(np.nan, np.nan) if camera.image_size is None else camera.image_size for camera in cameras]
+        return cls(
+            names=tuple(camera.name for camera in cameras),
+            intrinsics=_stacked("matrix", [camera.matrix for camera in cameras], (3, 3)),
+            distortion=tuple(as_float64("distortion", camera.distortion).flatten() for camera in cameras),
+            fisheye=tuple(camera.fisheye for camera in cameras),
+            image_size=_stacked("image size", sizes, (2,)),
+            rotations=torch.stack([rotation_matrix(camera.rotation) for camera in cameras]) if posed and cameras else None,
+            translations=_stacked("translation", [camera.translation for camera in cameras], (3,)) * METRES[unit or "m"]
+            if posed
+            else None,
+            unit=unit,
+        )
+
+    def poses(self, unit: str | None = None) -> tuple[Tensor, Tensor]:
+        """The rotations (C, 3, 3) and the translations (C, 3) in metres, world to camera.
+
+        Args:
+            unit: of the file, a key of :data:`METRES`; needed where :attr:`unit` is None.
+
+        Raises:
+            CalibrationError: if there are no poses, or if their unit is not known or another one.
+        """
+        if self.rotations is None or self.translations is None:
+            raise CalibrationError(
+                "a calibration without poses", where="Rig", got="intrinsics alone", expected="a pose of every camera"
+            )
+        if unit is not None and unit not in METRES:
+            raise CalibrationError("no unit of length", where="units", got=repr(unit), expected=f"one of {', '.join(METRES)}")
+        if self.unit is None and unit is None:
+            raise CalibrationError(
+                "the unit of length is not known",
+                where="units",
+                got="a file that does not say it",
+                expected=f"one of {', '.join(METRES)}",
+                remedy="Say it with --units.",
+            )
+        if self.unit is not None and unit not in (None, self.unit):
+            raise CalibrationError("another unit of length", where="units", got=unit, expected=f"{self.unit}, as in the file")
+        return self.rotations, self.translations * (METRES[unit] if self.unit is None and unit else 1.0)
 
     def __post_init__(self) -> None:
         put_float64(self, ("rotations", "translations", "intrinsics", "image_size"))
@@ -55,8 +135,29 @@ class Rig:
                 raise CalibrationError(
                     "not one value for each camera", where=f"Rig: {name}", got=count, expected=f"{cameras}, and 1 or more"
                 )
-        check_finite("Rig", {name: getattr(self, name) for name in shapes} | {"distortion": torch.cat(distortion)})
-        check_rotations("Rig", self.rotations)
+        finite = {name: getattr(self, name) for name in shapes if name != "image_size"}
+        check_finite("Rig", finite | {"distortion": torch.cat(distortion)})
+        if self.image_size is not None and bool(((self.image_size <= 0) | self.image_size.isinf()).any()):
+            got = self.image_size.tolist()
+            raise CalibrationError("an image without pixels", where="Rig: image_size", got=got, expected="width and height")
+        if self.rotations is not None:
+            check_rotations("Rig", self.rotations)
+
+
+def rotation_matrix(rotation: Any) -> Tensor:
+    """The matrix (3, 3) of a rotation vector of 3 numbers, or of a matrix of 9.
+
+    Raises:
+        CalibrationError: if it is neither.
+    """
+    values = as_float64("rotation", rotation)
+    if values.numel() == 9:
+        return values.reshape(3, 3)
+    if values.numel() == 3:
+        check_finite("rotation", {"vector": values})
+        return torch.from_numpy(cv2.Rodrigues(values.reshape(3).numpy())[0])
+    got = f"{values.numel()} numbers"
+    raise CalibrationError("not a rotation", where="rotation", got=got, expected="a vector of 3 numbers or a matrix of 9")
 
 
 def put_float64(owner: Any, names: tuple[str, ...]) -> None:
@@ -101,3 +202,16 @@ def check_rotations(owner: str, rotations: Tensor) -> None:
             expected="an orthogonal matrix of determinant 1",
             remedy="Rotations are given as matrices from the world to the camera.",
         )
+
+
+def _stacked(what: str, values: Sequence[Any], shape: tuple[int, ...]) -> Tensor:
+    """Values (C, *shape) of all cameras.
+
+    Raises:
+        CalibrationError: if one of them has another number of numbers.
+    """
+    tensors = [as_float64(what, value) for value in values]
+    for tensor in tensors:
+        if tensor.numel() != int(np.prod(shape)):
+            raise CalibrationError("a value of another shape", where=what, got=tuple(tensor.shape), expected=str(shape))
+    return torch.stack([tensor.reshape(shape) for tensor in tensors]) if tensors else torch.zeros(0, *shape)

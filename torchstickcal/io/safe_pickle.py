@@ -72,6 +72,21 @@ def load(path: str | Path) -> Any:
         raise FileFormatError(error.what, where=error.where, got=error.got, expected=expected, remedy=remedy) from error
 
 
+def loads(content: bytes) -> Any:
+    """The content of a pickle of plain data in memory, such as an attribute of an HDF5 file.
+
+    Raises:
+        ValueError: if it holds anything else, or would need much more memory than it is long. Others if it is damaged.
+
+    Example:
+        >>> loads(b"(lp0\\nVknob\\np1\\na.")
+        ['knob']
+    """
+    found = _Machine().run(content)
+    _check_size(found, GROWTH * len(content) + SLACK_BYTES)
+    return found
+
+
 class _Unfinished:
     """An array or a type whose parts the file has not given yet."""
 

@@ -24,7 +24,9 @@ SPORTS_STICK_SYN_JOINTS = (
 _DESCRIPTION = "sequence of the data set Sports-Stick-Syn (a pickle; none of its code is run)"
 
 
-@session_reader("sports-stick-syn", _DESCRIPTION, recognises=lambda path, head: head.startswith(b"\x80"))
+@session_reader(
+    "sports-stick-syn", _DESCRIPTION, recognises=lambda path, head: head.startswith(b"\x80") and b"intrinsicMat" not in head
+)
 def read_sports_stick_syn(path: str | Path) -> tuple[Observations, Truth]:
     """Read a sequence of Sports-Stick-Syn, the data set of the paper. The file is a pickle; none of its code is run.
 
