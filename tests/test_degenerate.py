@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import Literal
 
+import numpy as np
 import pytest
 import torch
 from torch import Tensor
@@ -13,6 +14,7 @@ from torchstickcal import CalibrationLayer, Observations, RigError, Stick, calib
 from torchstickcal.config import Refine
 from torchstickcal.geometry.singular import covariance_of, solve_information
 from torchstickcal.model.measurements import Measurements
+from torchstickcal.pipeline.initialise.graph import _resected
 from torchstickcal.pipeline.scale import Ruler, scale_factors
 from torchstickcal.pipeline.synchronise import search_offsets
 from torchstickcal.pipeline.synchronise.search import unsynchronised
@@ -146,6 +148,14 @@ def test_a_ruler_that_is_never_reconstructed_sets_no_scale():
     factors.sum().backward()
     assert points.grad is not None
     assert not points.grad.any()
+
+
+@pytest.mark.parametrize("extent", [0.0, 1e-9, 1e300])
+def test_points_in_one_place_place_no_camera(extent: float):
+    generator = np.random.default_rng(0)
+    points, rays = 1 + extent * generator.normal(size=(3, 20)), generator.normal(size=(2, 20))
+    pose = _resected(points, rays, 0.01)
+    assert pose is None or all(np.isfinite(part).all() for part in pose)
 
 
 @pytest.mark.parametrize("config", ["lbfgs", "paper"])

@@ -115,17 +115,29 @@ def _place_again(rotations: Array, translations: Array, rays: Array, visible: ND
             before = _supported(camera, rotations, translations, rays, visible, scale)
             if len(before.seen) < _MIN_POINTS:
                 continue
-            points, image = before.known[:, before.seen].T, rays[camera][:, before.seen].T
-            found, turn, shift, _ = cv2.solvePnPRansac(
-                np.ascontiguousarray(points), np.ascontiguousarray(image), np.eye(3), None,
-                iterationsCount=_PNP_ROUNDS, reprojectionError=scale / 2, confidence=0.9999, flags=cv2.SOLVEPNP_SQPNP,
-            )  # fmt: skip
-            if not found or not (np.isfinite(turn).all() and np.isfinite(shift).all()):
+            pose = _resected(before.known[:, before.seen], rays[camera][:, before.seen], scale)
+            if pose is None:
                 continue
             kept = rotations[camera].copy(), translations[camera].copy()
-            rotations[camera], translations[camera] = cv2.Rodrigues(turn)[0], shift[:, 0]
+            rotations[camera], translations[camera] = pose
             if _supported(camera, rotations, translations, rays, visible, scale).share < before.share + _CLEAR_GAIN:
                 rotations[camera], translations[camera] = kept
+
+
+def _resected(points: Array, rays: Array, scale: float) -> tuple[Array, Array] | None:
+    """Rotation and translation of a camera by known points (3, n) and its rays (2, n) to them; None if none are found."""
+    points, rays = np.ascontiguousarray(points.T), np.ascontiguousarray(rays.T)
+    try:
+        found, turn, shift, _ = cv2.solvePnPRansac(
+            points, rays, np.eye(3), None,
+            iterationsCount=_PNP_ROUNDS, reprojectionError=scale / 2, confidence=0.9999, flags=cv2.SOLVEPNP_SQPNP,
+        )  # fmt: skip
+    except cv2.error:  # points in one place or on one line
+        return None
+    if not found or not (np.isfinite(turn).all() and np.isfinite(shift).all()):
+        return None
+    rotation, translation = (np.asarray(part, dtype=np.float64) for part in (cv2.Rodrigues(turn)[0], shift[:, 0]))
+    return rotation, translation
 
 
 class _Support(NamedTuple):
