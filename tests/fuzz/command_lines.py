@@ -69,8 +69,17 @@ VALUES: dict[str, list[str] | None] = {
     "--methods": ["default", "x", ",", ""],
     "--jobs": ["1", "0", "-1", "1.5", "x"],
     "--gif": None,
+    "--stick": ["0 1 0.5", "left_wrist right_wrist 0.4", "x y 1", "0 0 1", "0 1 nan", "0 1", "a b c d"],
+    "--stick-points": _PATHS,
+    "--intrinsics": ["calibration.toml", *_PATHS],
+    "--image-size": ["1920 1080", "0 1080", "nan 1", "1920", "x y"],
+    "--fps": ["60", *_NUMBERS],
+    "--skeleton": ["coco_17", "config.toml", "broken.toml", "missing.toml", "x", "", "folder"],
+    "--person": ["largest", "stick", "0", "-1", "99", "x", ""],
+    "--units": ["m", "mm", "x", ""],
 }
-"""The values that are tried of each option; None for an option without one. Those that would take long are left out."""
+"""The values that are tried of each option, words separated by blanks; None for an option without one. What would take long is
+left out."""
 
 COMMANDS = {
     "calibrate": (["session.npz"] * len(_PATHS) + _PATHS,),
@@ -81,8 +90,11 @@ COMMANDS = {
 }
 """The values that are tried of each argument of each command."""
 FITTING = {
-    "calibrate": ["--format", "--export", "--config", "--refine", "--no-sync", "--stick-length", "--stick-sigma", "--plugin"],
-    "evaluate": ["--format", "--json", "--plugin"],
+    "calibrate": [
+        *("--format", "--export", "--config", "--refine", "--no-sync", "--stick-length", "--stick-sigma", "--plugin"),
+        *("--stick", "--stick-points", "--intrinsics", "--image-size", "--fps", "--skeleton", "--person"),
+    ],
+    "evaluate": ["--format", "--json", "--plugin", "--units"],
     "simulate": ["--seed", "--plugin"],
     "benchmark": ["--json", "--config", "--plugin", "--count"],
     "list": ["--plugin"],
@@ -104,5 +116,7 @@ def command_lines(draw: st.DrawFn) -> list[str]:
         options.append(draw(st.sampled_from(list(VALUES))))
     for option in options:
         values = VALUES[option]
-        words += [option] if values is None else [option, draw(st.one_of(st.just(values[0]), st.sampled_from(values)))]
+        value = draw(st.one_of(st.just(values[0]), st.sampled_from(values))) if values else ""
+        several = option in ("--stick", "--image-size")
+        words += [option] if values is None else [option, *(value.split() if several else [value])]
     return words
