@@ -12,7 +12,7 @@ slope for exact gradients follow from them by automatic differentiation. A loss 
 ``slope`` with closed forms. Leading dimensions before those named stand for sessions: scalars sum over them, linearised forms
 keep them.
 
-The losses compute in float32 at least, in the highest precision of what they are given, whether or not in an autocast region.
+The losses compute in the highest precision among their inputs, and in float32 at least. Autocast does not change that.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Files of every kind that were written whole and then damaged, each told in a few words that make it again."""
+"""Damaged files of every kind. A short description of each, which a failing test prints, makes the same file again."""
 
 from __future__ import annotations
 

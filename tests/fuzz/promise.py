@@ -181,7 +181,7 @@ def check_equal(one: Any, other: Any, where: str = "") -> None:
 
 
 def read_in_a_child(read: Callable[[], object]) -> str:
-    """Read a file in a process of its own, whose death, time and memory can be told.
+    """Read a file in a process of its own, so that a crash, its time and its memory can be measured.
 
     Returns:
         "accepted", or "refused" for one of the library's own errors or of the operating system.

@@ -1,4 +1,4 @@
-"""Sessions that were simulated and then spoiled, each told in a few words that make it again."""
+"""Simulated sessions that are then spoiled. A short description of each, which a failing test prints, makes it again."""
 
 from __future__ import annotations
 

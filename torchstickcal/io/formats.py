@@ -351,8 +351,7 @@ def read_calibration(path: str | Path, format: str | None = None) -> Rig:
 
     Example: see :func:`write_calibration`.
     """
-    reader: Reader[Rig] = find_reader(path, CALIBRATION_READERS) if format is None else CALIBRATION_READERS[format]
-    return reader.read(path)
+    return reader_of(path, CALIBRATION_READERS, format).read(path)
 
 
 def write_calibration(path: str | Path, calibration: Calibration, format: str) -> None:
@@ -383,6 +382,11 @@ def write_calibration(path: str | Path, calibration: Calibration, format: str) -
         (('cam01', 'cam02', 'cam03'), torch.Size([3, 3]))
     """
     CALIBRATION_WRITERS[format].write(path, calibration)
+
+
+def reader_of(path: str | Path, registry: Registry[Reader[_Content]], format: str | None) -> Reader[_Content]:
+    """The reader of a format; None for the one that recognises the path. Raises as :func:`read_calibration`."""
+    return find_reader(path, registry) if format is None else registry[format]
 
 
 def find_reader(path: str | Path, *registries: Registry[Any]) -> Reader[Any]:

@@ -120,7 +120,7 @@ def complete(recording: Recording, given: Given) -> tuple[Observations, tuple[st
 
 
 def amended(observations: Observations, given: Given) -> tuple[Observations, tuple[str, ...]]:
-    """A session with what is given in the place of what it holds.
+    """A session in which what the user gives replaces what the file holds.
 
     Raises:
         CalibrationError: if something is given that a session cannot be told, or that does not fit to it.

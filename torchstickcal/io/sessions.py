@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from torchstickcal.errors import CalibrationError, ConfigError
-from torchstickcal.io.formats import KEYPOINT_READERS, SESSION_READERS, Reader, Session, find_reader, session_of
+from torchstickcal.io.formats import KEYPOINT_READERS, SESSION_READERS, Session, find_reader, reader_of, session_of
 from torchstickcal.io.given import Given, amended, complete
 from torchstickcal.io.recording import Recording
 from torchstickcal.io.truth import Truth
@@ -123,8 +123,7 @@ def read_recording(path: str | Path, format: str | None = None) -> Recording:
         >>> [view.name for view in recording.views], recording.num_points
         (['left', 'right'], 2)
     """
-    reader: Reader[Recording] = find_reader(path, KEYPOINT_READERS) if format is None else KEYPOINT_READERS[format]
-    return reader.read(path)
+    return reader_of(path, KEYPOINT_READERS, format).read(path)
 
 
 def _content(path: str | Path, format: str | None) -> Session | Recording:

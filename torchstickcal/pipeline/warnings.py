@@ -13,6 +13,7 @@ from torchstickcal.model.unknowns import CameraUnknown, all_unknowns
 from torchstickcal.observations import Observations
 from torchstickcal.pipeline.adjust import Adjustment
 from torchstickcal.pipeline.relabel import exchanges
+from torchstickcal.pipeline.stage import agreeing_cameras
 from torchstickcal.pipeline.synchronise import ClockEstimate
 from torchstickcal.result import CameraParameter
 from torchstickcal.solvers.elimination.normal_equations import NormalEquations
@@ -79,7 +80,7 @@ def _keypoints(ended: Adjustment) -> list[str]:
     """Keypoints that took no part, and points that are too noisy."""
     observations, measurements = ended.observations[0], ended.measurements
     found: list[str] = []
-    comparable, kept = int(measurements.visible.sum()), int(ended.last.inliers.sum())
+    comparable, kept, agreeing = int(measurements.visible.sum()), int(ended.last.inliers.sum()), ended.kept
     takes_part = measurements.by_frame(measurements.active[0]).any(0)
     same_person = ~ended.frames[0].to_own(ended.labels.other_person[0], False)
     seen = int((observations.visible[:, :, takes_part] & same_person[..., None]).sum())
@@ -88,10 +89,10 @@ def _keypoints(ended: Adjustment) -> list[str]:
     if comparable > kept:
         share = (comparable - kept) / comparable
         found.append(f"{comparable - kept} of {comparable} keypoints ({share:.1%}) were rejected: they contradict the others.")
-    for camera in (~ended.agreeing_cameras[0]).nonzero().flatten().tolist():
-        own, agreeing = (int(m.visible[0, camera].sum()) for m in (measurements, ended.kept))
+    for camera in (~agreeing_cameras(measurements, agreeing)[0]).nonzero().flatten().tolist():
+        own, left = (int(m.visible[0, camera].sum()) for m in (measurements, agreeing))
         found.append(
-            f"{observations.camera_label(camera)}: {agreeing} of {own} keypoints agree with the other cameras, so that nothing "
+            f"{observations.camera_label(camera)}: {left} of {own} keypoints agree with the other cameras, so that nothing "
             "is known of where it is. Check that it shows the same athlete at the same time, and that its intrinsics are right."
         )
     sigma_px = ended.last.sigma_px[0]

@@ -17,7 +17,7 @@ DAMAGES: dict[str, Damage] = {}
 
 
 def _operations(content: bytes) -> list[bytes]:
-    """The bytes of each operation of a pickle; what cannot be told apart any more is one of them."""
+    """The bytes of each operation of a pickle. From the first damaged operation on, the rest of the bytes is one item."""
     places: list[int] = []
     with contextlib.suppress(ValueError):
         for _, _, place in pickletools.genops(content):

@@ -156,16 +156,24 @@ def _supported(
 ) -> _Support:
     """The support of a camera by the points of all others."""
     others = [other for other in range(len(rays)) if other != camera]
-    known = triangulate_robustly(
-        torch.from_numpy(rotations[others]),
-        torch.from_numpy(translations[others]),
-        torch.from_numpy(rays[others]),
-        torch.from_numpy(visible[others]).double(),
-        scale=scale,
-    ).numpy()
+    known = _points(triangulate_robustly, others, rotations, translations, rays, visible, scale)
     seen = np.flatnonzero(visible[camera] & np.isfinite(known).all(0))
     weights = _kernel_weights(rotations[camera], translations[camera], known[:, seen], rays[camera][:, seen], scale)
     return _Support(float(weights.mean()) if len(seen) else 1.0, known, seen)
+
+
+def _points(
+    method: Callable[..., torch.Tensor],
+    cameras: list[int],
+    rotations: Array,
+    translations: Array,
+    rays: Array,
+    visible: NDArray[np.bool_],
+    scale: float,
+) -> Array:
+    """Points (3, n) that some of the cameras see, triangulated by a method; NaN where fewer than two of them do."""
+    known = (torch.from_numpy(of_cameras[cameras]) for of_cameras in (rotations, translations, rays))
+    return method(*known, torch.from_numpy(visible[cameras]).double(), scale=scale).numpy()
 
 
 def _kernel_weights(rotation: Array, translation: Array, points: Array, rays: Array, scale: float) -> Array:
@@ -186,13 +194,7 @@ def _place_cameras(
     placed = [edges[0].parent, edges[0].child]
     support = float(root.in_front)
     for edge in edges[1:]:
-        known = triangulate(
-            torch.from_numpy(rotations[placed]),
-            torch.from_numpy(translations[placed]),
-            torch.from_numpy(rays[placed]),
-            torch.from_numpy(visible[placed]).double(),
-            scale=scale,
-        ).numpy()
+        known = _points(triangulate, placed, rotations, translations, rays, visible, scale)
         candidates = [_place_camera(pose, edge, rotations, translations, known, rays, visible, scale) for pose in edge.poses]
         gained, rotations[edge.child], translations[edge.child] = max(candidates, key=lambda candidate: candidate[0])
         support += gained

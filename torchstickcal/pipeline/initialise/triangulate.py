@@ -49,7 +49,6 @@ def triangulate_robustly(
         own = agreement(candidates)
         better = both & (own > score)
         best, score = torch.where(better, candidates, best), torch.where(better, own, score)
-    points = points.clone()
     points[:, doubtful] = triangulate(rotations, translations, rays, weights, scale=of_points, start=best)
     return points
 
