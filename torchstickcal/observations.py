@@ -347,6 +347,14 @@ class Observations:
                 got=f"image_size {self.image_size}, fps {self.fps}",
                 expected="image_size, and fps or timestamps",
             )
+        if self.readout_s is not None and self.fps is not None and self.readout_s * self.fps > 1:
+            raise ObservationError(
+                "a read-out time longer than a frame",
+                where="readout_s",
+                got=f"{self.readout_s:g} s",
+                expected=f"at most {1 / self.fps:g} s at {self.fps:g} frames per second",
+                remedy="Give it in seconds; most cameras need 0.005 to 0.03 s.",
+            )
 
     def _check_sticks(self) -> None:
         check_ends(self.sticks, self.num_points)
