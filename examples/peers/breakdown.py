@@ -4,8 +4,8 @@
     (each program on `breakdown`, and compare.py breakdown --peer ... --out scores.jsonl, as in README.md)
     python examples/peers/breakdown.py scores.jsonl --out breakdown.png
 
-The sessions' names begin with their share of outliers. A session that a program refused counts as a failure; in the figure it lies
-at the upper edge.
+The sessions' names begin with their share of outliers. A session that a program refused counts as a failure; in the figure it
+lies at the upper edge.
 """
 
 from __future__ import annotations

@@ -163,7 +163,7 @@ def hard() -> tuple[SessionSpec, ...]:
 
 
 def breakdown() -> tuple[SessionSpec, ...]:
-    """35 sessions of 4 cameras, 60 frames each, in which 0 to 60 % of the keypoints are outliers: where a method breaks down."""
+    """35 sessions of 4 cameras and 60 frames, in which 0 to 60 % of the keypoints are outliers: where does a method fail?"""
     return tuple(
         SessionSpec(
             name=f"outliers{round(100 * share):02d}_{sport}_{number}",
