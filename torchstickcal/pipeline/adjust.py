@@ -131,6 +131,14 @@ class Adjustment:
         found = self.seen.unknowns.by_name(self.state.unknowns).get("time_offset")
         return torch.zeros_like(self.frames[0].offsets_frames) if found is None else found[0, :, 0]
 
+    @property
+    def deviations(self) -> dict[str, Tensor]:
+        """(C, n), what was found beyond the given values in one session, by the name of the unknown, in units of deviations."""
+        found = {name: own[0] for name, own in self.seen.unknowns.by_name(self.state.unknowns).items()}
+        if "time_offset" in found:
+            found["time_offset"] = found["time_offset"] + self.frames[0].offsets_frames[:, None]
+        return found
+
     def __getitem__(self, session: int) -> Adjustment:
         """One of the sessions that has just begun or ended a stage, without results."""
         one = slice(session, session + 1)

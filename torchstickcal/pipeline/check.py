@@ -8,7 +8,7 @@ strongly the keypoints ask for this choice.
 from __future__ import annotations
 
 import itertools
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -32,10 +32,12 @@ _CHECKED_FRAMES = 5000
 _SIGMAS = 4.0
 _STEPS = 8
 """Most steps to the least cost with all lenses and clocks unknown."""
-_FRAME_FOLDS, _POINT_FOLDS = 4, 3
+_FRAME_FOLDS, _POINT_FOLDS = 8, 3
 """Parts of the frames and of the points that in turn take no part in finding what is refined, and judge it."""
 _PRICE = 4.0
 """Decrease of the cost that each further unknown has to bring, in units of a squared standard deviation; chance brings 1."""
+_LARGEST_LOSS = 0.1
+"""What a choice may lose in the parts of the frames that it makes fit worse, as a share of what it gains in the others."""
 
 
 class Suggestion(NamedTuple):
@@ -54,6 +56,16 @@ class Fold(NamedTuple):
     gradient: Tensor
 
 
+class Solution(NamedTuple):
+    """What some unknowns would be by the keypoints, everything else being unknown as it is."""
+
+    unknowns: RigUnknowns
+    values: Tensor
+    """(K,)"""
+    covariance: Tensor
+    """(K, K)"""
+
+
 class CameraCheck:
     """One session's cameras at a solution, examined as if their lenses and clocks were unknown.
 
@@ -70,6 +82,7 @@ class CameraCheck:
         cameras = kept.cameras_at(state).to(torch.float64)
         self._cameras, self._groups = cameras, groups
         self._choices: dict[tuple[str, ...], tuple[Tensor, RigUnknowns]] = {}
+        self._solutions: dict[tuple[str, ...], Solution] = {}
         self._variants = {unknown.name: next(iter(unknown.variants)) for unknown in all_unknowns().values()}
         self._every = RigUnknowns.of(tuple(self._variants.values()), cameras, groups)
         sigma_px = result.sigma_px
@@ -96,44 +109,95 @@ class CameraCheck:
     def wanted(
         self, allowed: Collection[str], refined: Sequence[str] = (), failed: Sequence[tuple[str, ...]] = ()
     ) -> tuple[str, ...]:
-        """The refinements that the keypoints ask for most beside those made; none where the cameras agree with the keypoints.
+        """The refinements beside those made that explain the keypoints best, if they are needed beyond doubt; else none.
+
+        A choice is doubtful if another one explains the keypoints clearly better, if its values could be chance or the usual
+        error of a calibration, or if it makes some frames or points fit worse when it was found without them.
 
         Args:
             allowed: what may be refined.
             refined: the refinements made.
-            failed: choices that were tried and did not converge.
+            failed: choices that were tried and rejected.
         """
-        best, choice = _SIGMAS**2, ()
-        for names in _choices():
-            if names in failed or not set(names) <= set(allowed) or with_refinements(refined, names) == tuple(refined):
-                continue
-            gain = self._gain(names)
-            if gain > best and self._predicts(names):
-                best, choice = gain, names
-        return choice
+        gains = {
+            names: self._gain(names)
+            for names in _choices()
+            if set(names) <= set(allowed) and with_refinements(refined, names) != tuple(refined)
+        }
+        clear = _SIGMAS**2
+        least = max(clear, max(gains.values(), default=0.0) - clear)
+        for names in sorted(gains, key=lambda names: -gains[names]):
+            if gains[names] > least and names not in failed and self._is_needed(names) and self._predicts(names):
+                return names
+        return ()
+
+    def confirms(self, names: tuple[str, ...], deviations: Mapping[str, Tensor]) -> bool:
+        """Whether values at which a choice has been found, here where it is refined, are not chance or usual errors.
+
+        Args:
+            names: the choice.
+            deviations: (C, n), from the given values, by the name of the unknown.
+        """
+        unknowns = self._solved(names).unknowns
+        return self._is_needed(names, unknowns.of_cameras({name: own[None] for name, own in deviations.items()})[0])
 
     def _gain(self, names: tuple[str, ...]) -> float:
         """Squared length of a choice's values in their standard deviations, less a price for each of its unknowns.
 
         Where the errors of the keypoints are independent, it is the decrease of the cost that the choice promises.
         """
-        unknowns, values, covariance = self._solved(names)
-        return float(values @ solve_information(covariance, values)) - _PRICE * unknowns.count
+        solution = self._solved(names)
+        return _gain(solution.values, solution.covariance)
+
+    def _is_needed(self, names: tuple[str, ...], values: Tensor | None = None) -> bool:
+        """Whether a choice's values are far from those given, by what the parts of the frames say of their uncertainty.
+
+        That holds for all values together, and for those of each unknown, given the usual errors of calibrations.
+
+        Args:
+            names: the choice.
+            values: (K,), None for those that the keypoints suggest.
+        """
+        unknowns, suggested, covariance = self._solved(names)
+        covariance, values = self._inflation(names) * covariance, suggested if values is None else values
+        if _gain(values, covariance) <= _SIGMAS**2:
+            return False
+        usual = covariance + unknowns.usual_sigma[0].square().diag()
+        return all(_is_far(values[own], usual[own][:, own]) for own in unknowns.columns.values())
+
+    def _inflation(self, names: tuple[str, ...]) -> float:
+        """How much larger the variances of a choice's values are than those told, by the scatter between parts of the frames.
+
+        Errors that several points or cameras have in common in a frame are alike. That is seen here, not in any point's track.
+        """
+        folds, _ = self._folds
+        if not folds:
+            return 1.0
+        poses = len(self._gradient) - self._every.count
+        without = torch.stack([self._step_without(fold, names)[poses:] for fold in folds])
+        jackknife = (len(folds) - 1) * without.var(0, correction=0)
+        return max(1.0, float((jackknife / self._solved(names).covariance.diagonal()).mean()))
 
     def _predicts(self, names: tuple[str, ...]) -> bool:
         """Whether a choice, found without some frames or without some points, makes these fit better, beyond doubt."""
-        return all(_certain(torch.stack([self._gain_on(fold, names) for fold in folds])) for folds in self._folds if folds)
+        gains = [torch.stack([self._gain_on(fold, names) for fold in folds]) for folds in self._folds if folds]
+        lost = gains[0].clamp_max(0).sum() if self._folds[0] else 0.0
+        return all(map(_certain, gains)) and bool(-lost <= _LARGEST_LOSS * gains[0].clamp_min(0).sum() if gains else True)
 
     def _gain_on(self, fold: Fold, names: tuple[str, ...]) -> Tensor:
         """Decrease of a fold's cost by a choice that was found without it, beyond that by the poses alone."""
-        information, gradient = self._information - fold.information, self._gradient - fold.gradient
 
         def decrease(names: tuple[str, ...]) -> Tensor:
-            chosen, _ = self._chosen(names)
-            step = -chosen @ solve_information(chosen.mT @ information @ chosen, chosen.mT @ gradient)
+            step = self._chosen(names)[0] @ self._step_without(fold, names)
             return -step @ (2 * fold.gradient + fold.information @ step)
 
         return decrease(names) - decrease(())
+
+    def _step_without(self, fold: Fold, names: tuple[str, ...]) -> Tensor:
+        """Poses and a choice's values as found without a fold."""
+        information, gradient = self._information - fold.information, self._gradient - fold.gradient
+        chosen, _ = self._chosen(names)
+        return -solve_information(chosen.mT @ information @ chosen, chosen.mT @ gradient)
 
     @cached_property
     def _folds(self) -> tuple[list[Fold], list[Fold]]:
@@ -148,8 +212,10 @@ class CameraCheck:
         of_points = [_fold(m.keeping(kept), self._objective, self._state) for kept in _point_groups(self._objective)]
         return of_frames if len(of_frames) > 1 else [], of_points if len(of_points) > 1 else []
 
-    def _solved(self, names: tuple[str, ...]) -> tuple[RigUnknowns, Tensor, Tensor]:
+    def _solved(self, names: tuple[str, ...]) -> Solution:
         """A choice's unknowns, their values and their covariance."""
+        if names in self._solutions:
+            return self._solutions[names]
         chosen, unknowns = self._chosen(names)
         poses = len(self._gradient) - self._every.count
         information = chosen.mT @ self._information @ chosen
@@ -157,7 +223,8 @@ class CameraCheck:
         covariance = covariance_of(information)
         if self._gradient_covariance is not self._information:
             covariance = covariance @ chosen.mT @ self._gradient_covariance @ chosen @ covariance
-        return unknowns, values, covariance[poses:, poses:]
+        self._solutions[names] = Solution(unknowns, values, covariance[poses:, poses:])
+        return self._solutions[names]
 
     def _chosen(self, names: tuple[str, ...]) -> tuple[Tensor, RigUnknowns]:
         """The map from poses and a choice's unknowns to poses and all unknowns, and the choice's unknowns."""
@@ -213,6 +280,17 @@ def _point_groups(objective: Objective) -> list[Tensor]:
     for number, group in enumerate(groups):
         group[single[number::_POINT_FOLDS]] = True
     return [group.repeat(m.frames) for group in groups]
+
+
+def _gain(values: Tensor, covariance: Tensor) -> float:
+    """Squared length of values (K,) in their standard deviations, less a price for each."""
+    return float(values @ solve_information(covariance, values)) - _PRICE * len(values)
+
+
+def _is_far(values: Tensor, covariance: Tensor) -> bool:
+    """Whether all values (K,) together, or one of them alone, are clearly not zero."""
+    largest = float((values.square() / covariance.diagonal()).max()) - _PRICE
+    return max(largest, _gain(values, covariance)) > _SIGMAS**2
 
 
 def _certain(gains: Tensor) -> bool:

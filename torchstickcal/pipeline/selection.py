@@ -17,6 +17,8 @@ from torchstickcal.pipeline.run import Run
 from torchstickcal.pipeline.synchronise import ClockEstimate, on_common_frames, search_offsets, unsynchronised
 
 _MAX_STARTS = 3
+_MOST_TRIALS = 3
+"""Adjustments with more refined that ``auto`` tries."""
 _FAR_FRAMES = 0.75
 """Remaining time offset, in frames, from which on a camera's frames are chosen anew."""
 _FITTING_SHARE, _FITTING_FOCAL_SHARE = 0.6, 0.01
@@ -89,12 +91,24 @@ class ModelSelection:
         return best if set(self.named) <= set(best.refined) else self._with(best, self.named), clocks
 
     def refined_where_contradicted(self, adjusted: Adjustment, check: CameraCheck) -> tuple[Adjustment, CameraCheck]:
-        """Adjusted with what the keypoints contradict of the cameras, the most contradicted first, and checked again."""
+        """Adjusted with what the keypoints contradict of the cameras, the most contradicted first, and checked again.
+
+        What was found is kept only if it fits better and is still needed there: the check is about the first step, and the
+        adjustment may end elsewhere. Where the given cameras do not converge, nothing more is estimated.
+        """
         failed: list[tuple[str, ...]] = []
-        while choice := check.wanted(self.allowed, adjusted.refined, failed):
+        for _ in range(_MOST_TRIALS if adjusted.converged else 0):
+            choice = check.wanted(self.allowed, adjusted.refined, failed)
+            if not choice:
+                break
             refined = self._with(adjusted, with_refinements(adjusted.refined, choice))
-            if refined.converged:
-                adjusted, check = refined, CameraCheck(refined, self._run.config.camera_groups)
+            refined_check = CameraCheck(refined, self._run.config.camera_groups) if refined.converged else None
+            if (
+                refined_check is not None
+                and _median_squared_residual(refined) <= _median_squared_residual(adjusted)
+                and refined_check.confirms(choice, refined.deviations)
+            ):
+                adjusted, check = refined, refined_check
             else:
                 failed.append(choice)
         return adjusted, check
