@@ -36,6 +36,10 @@ _FRAME_FOLDS, _POINT_FOLDS = 8, 3
 """Parts of the frames and of the points that in turn take no part in finding what is refined, and judge it."""
 _PRICE = 4.0
 """Decrease of the cost that each further unknown has to bring, in units of a squared standard deviation; chance brings 1."""
+_ALIKE = 0.05
+"""Relative difference of the decreases of the cost up to which two choices explain the keypoints equally well."""
+_STRAIGHT_FRAMES = 0.25
+"""Time over which the motion of the keypoints may be taken as straight."""
 _LARGEST_LOSS = 0.1
 """What a choice may lose in the parts of the frames that it makes fit worse, as a share of what it gains in the others."""
 
@@ -109,10 +113,11 @@ class CameraCheck:
     def wanted(
         self, allowed: Collection[str], refined: Sequence[str] = (), failed: Sequence[tuple[str, ...]] = ()
     ) -> tuple[str, ...]:
-        """The refinements beside those made that explain the keypoints best, if they are needed beyond doubt; else none.
+        """The refinements beside those made that are worth a trial; none where the cameras agree with the keypoints.
 
-        A choice is doubtful if another one explains the keypoints clearly better, if its values could be chance or the usual
-        error of a calibration, or if it makes some frames or points fit worse when it was found without them.
+        Of the choices that explain the keypoints about equally well, and better than all others, it is the one with the fewest
+        unknowns. A worse explanation is never taken instead: it would be an excuse for what the better one says. The choice
+        has to be needed and to predict (:meth:`confirms`), unless clocks are so far off that this is only seen after a trial.
 
         Args:
             allowed: what may be refined.
@@ -124,22 +129,27 @@ class CameraCheck:
             for names in _choices()
             if set(names) <= set(allowed) and with_refinements(refined, names) != tuple(refined)
         }
-        clear = _SIGMAS**2
-        least = max(clear, max(gains.values(), default=0.0) - clear)
-        for names in sorted(gains, key=lambda names: -gains[names]):
-            if gains[names] > least and names not in failed and self._is_needed(names) and self._predicts(names):
+        clear, best = _SIGMAS**2, max(gains.values(), default=0.0)
+        least = max(clear, best - max(clear, _ALIKE * best))
+        alike = [names for names, gain in gains.items() if gain > least and names not in failed]
+        for names in sorted(alike, key=lambda names: (len(self._solved(names).values), -gains[names])):
+            if self._is_far_in_time(names) or (self._is_needed(names) and self._predicts(names)):
                 return names
         return ()
 
     def confirms(self, names: tuple[str, ...], deviations: Mapping[str, Tensor]) -> bool:
-        """Whether values at which a choice has been found, here where it is refined, are not chance or usual errors.
+        """Whether a choice that has been refined here is needed and predicts.
+
+        Needed: its values are far from those given, and so are those of each unknown, beyond chance and the usual errors of
+        calibrations. Predicts: found without some frames or some points, it makes these fit better.
 
         Args:
             names: the choice.
             deviations: (C, n), from the given values, by the name of the unknown.
         """
-        unknowns = self._solved(names).unknowns
-        return self._is_needed(names, unknowns.of_cameras({name: own[None] for name, own in deviations.items()})[0])
+        own = {name: deviation[None] for name, deviation in deviations.items()}
+        values = self._solved(names).unknowns.of_cameras(own)[0]
+        return self._is_needed(names, values) and self._predicts(names, values)
 
     def _gain(self, names: tuple[str, ...]) -> float:
         """Squared length of a choice's values in their standard deviations, less a price for each of its unknowns.
@@ -173,31 +183,56 @@ class CameraCheck:
         folds, _ = self._folds
         if not folds:
             return 1.0
-        poses = len(self._gradient) - self._every.count
-        without = torch.stack([self._step_without(fold, names)[poses:] for fold in folds])
+        chosen, unknowns = self._chosen(names)
+        without = torch.stack([solve_information(*self._without(fold, chosen)) for fold in folds])[:, -unknowns.count :]
         jackknife = (len(folds) - 1) * without.var(0, correction=0)
         return max(1.0, float((jackknife / self._solved(names).covariance.diagonal()).mean()))
 
-    def _predicts(self, names: tuple[str, ...]) -> bool:
-        """Whether a choice, found without some frames or without some points, makes these fit better, beyond doubt."""
-        gains = [torch.stack([self._gain_on(fold, names) for fold in folds]) for folds in self._folds if folds]
-        lost = gains[0].clamp_max(0).sum() if self._folds[0] else 0.0
-        return all(map(_certain, gains)) and bool(-lost <= _LARGEST_LOSS * gains[0].clamp_min(0).sum() if gains else True)
+    def _is_far_in_time(self, names: tuple[str, ...]) -> bool:
+        """Whether a choice has clocks that are farther off than the motion of the keypoints is straight."""
+        unknowns, values, _ = self._solved(names)
+        clocks = [columns for name, columns in unknowns.columns.items() if all_unknowns()[name].family == "clock"]
+        return any(bool((values[columns].abs() > _STRAIGHT_FRAMES).any()) for columns in clocks)
 
-    def _gain_on(self, fold: Fold, names: tuple[str, ...]) -> Tensor:
-        """Decrease of a fold's cost by a choice that was found without it, beyond that by the poses alone."""
+    def _predicts(self, names: tuple[str, ...], values: Tensor | None = None) -> bool:
+        """Whether a choice, found without some frames or without some points, makes these fit better, beyond doubt.
 
-        def decrease(names: tuple[str, ...]) -> Tensor:
-            step = self._chosen(names)[0] @ self._step_without(fold, names)
+        Args:
+            names: the choice.
+            values: (K,), at which the cameras are; None for those given.
+        """
+        values = torch.zeros_like(self._solved(names).values) if values is None else values
+        of_frames, of_points = ([self._gain_on(fold, names, values) for fold in folds] for folds in self._folds)
+        if of_frames:
+            gains = torch.stack(of_frames)
+            if float(-gains.clamp_max(0).sum()) > _LARGEST_LOSS * float(gains.clamp_min(0).sum()):
+                return False
+        return all(_certain(torch.stack(gains)) for gains in (of_frames, of_points) if gains)
+
+    def _gain_on(self, fold: Fold, names: tuple[str, ...], values: Tensor) -> Tensor:
+        """Decrease of a fold's cost by a choice that was found without it, beyond that by the poses at the given values.
+
+        Args:
+            fold: the part of the keypoints.
+            names: the choice.
+            values: (K,), at which the cameras are.
+        """
+        chosen, _ = self._chosen(names)
+        poses = len(self._gradient) - self._every.count
+        information, gradient = self._without(fold, chosen)
+        moved = gradient[:poses] - information[:poses, poses:] @ values
+        given = torch.cat([-solve_information(information[:poses, :poses], moved), -values])
+
+        def decrease(step: Tensor) -> Tensor:
+            step = chosen @ step
             return -step @ (2 * fold.gradient + fold.information @ step)
 
-        return decrease(names) - decrease(())
+        return decrease(-solve_information(information, gradient)) - decrease(given)
 
-    def _step_without(self, fold: Fold, names: tuple[str, ...]) -> Tensor:
-        """Poses and a choice's values as found without a fold."""
+    def _without(self, fold: Fold, chosen: Tensor) -> tuple[Tensor, Tensor]:
+        """The system of poses and a choice's unknowns of all keypoints but a fold's."""
         information, gradient = self._information - fold.information, self._gradient - fold.gradient
-        chosen, _ = self._chosen(names)
-        return -solve_information(chosen.mT @ information @ chosen, chosen.mT @ gradient)
+        return chosen.mT @ information @ chosen, chosen.mT @ gradient
 
     @cached_property
     def _folds(self) -> tuple[list[Fold], list[Fold]]:
