@@ -14,7 +14,14 @@ from torchstickcal.lazy import cached_property
 from torchstickcal.model.measurements import Measurements
 from torchstickcal.model.unknowns import REFINEMENTS, clock_refinements, with_refinements
 from torchstickcal.observations import Observations
-from torchstickcal.pipeline.adjust import Adjustment, adjust_again, adjust_cameras, begin, measured
+from torchstickcal.pipeline.adjust import (
+    Adjustment,
+    adjust_again,
+    adjust_cameras,
+    begin,
+    begin_at_nearest_frames,
+    measured,
+)
 from torchstickcal.pipeline.check import CameraCheck
 from torchstickcal.pipeline.run import Run
 from torchstickcal.pipeline.synchronise import ClockEstimate, on_common_frames, search_offsets, unsynchronised
@@ -167,11 +174,9 @@ class ModelSelection:
     def _at_nearest_frames(self, adjustment: Adjustment) -> Adjustment:
         """Adjusted anew with other frames, where the estimated time offsets say that those are closer in time, and they are."""
         for _ in range(_MAX_STARTS - 1):
-            remaining = adjustment.remaining_offsets_frames
-            if not bool((remaining.abs() > _FAR_FRAMES).any()):
+            if not bool((adjustment.remaining_offsets_frames.abs() > _FAR_FRAMES).any()):
                 break
-            offsets = adjustment.frames[0].offsets_frames + remaining
-            again = adjust_cameras(begin(self._observations, self._run, adjustment.refined, offsets), self._run)
+            again = adjust_cameras(begin_at_nearest_frames(adjustment, self._run), self._run, only_last=True)
             if _median_squared_residual(again) > _median_squared_residual(adjustment):
                 break
             adjustment = again
