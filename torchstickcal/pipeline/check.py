@@ -21,7 +21,7 @@ from torchstickcal.model.correlation import ErrorCorrelation, error_correlation
 from torchstickcal.model.measurements import Measurements
 from torchstickcal.model.objective import Objective
 from torchstickcal.model.state import State
-from torchstickcal.model.unknowns import RigUnknowns, all_unknowns, with_refinements
+from torchstickcal.model.unknowns import RigUnknowns, all_unknowns, clock_refinements, with_refinements
 from torchstickcal.pipeline.adjust import Adjustment
 from torchstickcal.solvers import Termination, ignore_record
 from torchstickcal.solvers.elimination.normal_equations import NormalEquations
@@ -122,18 +122,20 @@ class CameraCheck:
         Args:
             allowed: what may be refined.
             refined: the refinements made.
-            failed: choices that were tried and rejected.
+            failed: refinements that were tried and rejected.
         """
         gains = {
             names: self._gain(names)
             for names in _choices()
             if set(names) <= set(allowed) and with_refinements(refined, names) != tuple(refined)
         }
+        clocks_as_given = not clock_refinements() & set(refined)
         clear, best = _SIGMAS**2, max(gains.values(), default=0.0)
         least = max(clear, best - max(clear, _ALIKE * best))
-        alike = [names for names, gain in gains.items() if gain > least and names not in failed]
+        alike = [names for names, gain in gains.items() if gain > least and with_refinements(refined, names) not in failed]
         for names in sorted(alike, key=lambda names: (len(self._solved(names).values), -gains[names])):
-            if self._is_far_in_time(names) or (self._is_needed(names) and self._predicts(names)):
+            far = clocks_as_given and self._is_far_in_time(names)
+            if far or (self._is_needed(names) and self._predicts(names)):
                 return names
         return ()
 

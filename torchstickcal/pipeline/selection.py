@@ -125,7 +125,7 @@ class ModelSelection:
             ):
                 adjusted, check = refined, refined_check
             else:
-                failed.append(choice)
+                failed.append(refined.refined)
         return adjusted, check
 
     def _at_offsets(self, clocks: ClockEstimate) -> list[Adjustment]:
@@ -147,7 +147,7 @@ class ModelSelection:
         return found
 
     def _first_residual(self, offsets_frames: Tensor) -> float:
-        """Median squared residual after the first stage at some time offsets (C,), square pixels; infinite where there is no rig."""
+        """Median squared residual after the first stage at time offsets (C,), square pixels; infinite where there is no rig."""
         config = self._run.config
         first = Run(replace(config, stages=dict(list(config.stages.items())[:1]), relabel=False))
         try:

@@ -128,7 +128,7 @@ class RigUnknowns:
 
     @property
     def usual_sigma(self) -> Tensor:
-        """How far calibrated values usually are from the truth, standard deviations (B, K); less for means of several cameras."""
+        """Standard deviations (B, K) of calibrated values around the truth; smaller for means of several cameras."""
         usual = torch.zeros_like(self.prior_sigma)
         for unknown in self.unknowns:
             usual[:, self.columns[unknown.name]] = unknown.usual_prior_share
