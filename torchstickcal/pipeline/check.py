@@ -122,17 +122,17 @@ class CameraCheck:
         Args:
             allowed: what may be refined.
             refined: the refinements made.
-            failed: refinements that were tried and rejected.
+            failed: refinements that were tried and rejected; after them only parts of them are tried.
         """
-        gains = {
-            names: self._gain(names)
-            for names in _choices()
-            if set(names) <= set(allowed) and with_refinements(refined, names) != tuple(refined)
-        }
-        clocks_as_given = not clock_refinements() & set(refined)
+        gains: dict[tuple[str, ...], float] = {}
+        for names in _choices():
+            added = with_refinements(refined, names)
+            if set(names) <= set(allowed) and added != tuple(refined) and all(set(added) < set(other) for other in failed):
+                gains[names] = self._gain(names)
         clear, best = _SIGMAS**2, max(gains.values(), default=0.0)
         least = max(clear, best - max(clear, _ALIKE * best))
-        alike = [names for names, gain in gains.items() if gain > least and with_refinements(refined, names) not in failed]
+        clocks_as_given = not clock_refinements() & set(refined)
+        alike = [names for names, gain in gains.items() if gain > least]
         for names in sorted(alike, key=lambda names: (len(self._solved(names).values), -gains[names])):
             far = clocks_as_given and self._is_far_in_time(names)
             if far or (self._is_needed(names) and self._predicts(names)):

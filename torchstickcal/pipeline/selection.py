@@ -29,7 +29,7 @@ from torchstickcal.pipeline.synchronise import ClockEstimate, on_common_frames, 
 _MAX_STARTS = 3
 _MOST_TRIALS = 3
 """Adjustments with more refined that ``auto`` tries."""
-_BY_CHANCE = 1.05
+_BY_CHANCE = 1.1
 """Factor by which the median squared residual may grow where nothing has become worse."""
 _FAR_FRAMES = 0.5
 """Remaining time offset, in frames, from which on a camera's frames are chosen anew. Offsets of nearly a frame are found too
@@ -177,7 +177,7 @@ class ModelSelection:
             if not bool((adjustment.remaining_offsets_frames.abs() > _FAR_FRAMES).any()):
                 break
             again = adjust_cameras(begin_at_nearest_frames(adjustment, self._run), self._run, only_last=True)
-            if _median_squared_residual(again) > _median_squared_residual(adjustment):
+            if _median_squared_residual(again) > _BY_CHANCE * _median_squared_residual(adjustment):
                 break
             adjustment = again
         return adjustment
