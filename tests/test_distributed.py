@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import pytest
 import torch
 import torch.distributed as dist
@@ -9,6 +11,7 @@ from torch import Tensor, nn
 from torch.nn.parallel import DistributedDataParallel
 
 from torchstickcal import CalibrationLayer
+from torchstickcal.metrics import PoseErrorMetric
 from torchstickcal.simulate import Noise, golf_session
 
 
@@ -35,6 +38,13 @@ def sessions_with_failures() -> Tensor:
     return torch.cat([keypoints()[:1], torch.full_like(keypoints()[:1], torch.nan).expand(3, -1, -1, -1, -1)])
 
 
+def errors_of(count: int) -> tuple[Tensor, ...]:
+    """Poses of some sessions, and the true ones."""
+    _, truth = golf_session(3, 1)
+    wrong = torch.stack([truth.translations * (1.0 + 0.1 * (session + count)) for session in range(count)])
+    return truth.rotations.expand(count, -1, -1, -1), wrong, truth.rotations, truth.translations
+
+
 def half(rank: int, folder: str) -> None:
     """One of two processes, each with half of the sessions."""
     torch.set_num_threads(1)
@@ -46,20 +56,30 @@ def half(rank: int, folder: str) -> None:
         loss.backward()
         found.append((loss.detach(), model.module.correction.grad))
         del loss, model
-    torch.save(found, f"{folder}/{rank}.pt")
+    metric = PoseErrorMetric()
+    metric.update(*errors_of(rank + 1))
+    torch.save([*found, metric.compute()], f"{folder}/{rank}.pt")
     dist.barrier()
     dist.destroy_process_group()
 
 
 @pytest.fixture(scope="module")
-def halves(tmp_path_factory: pytest.TempPathFactory) -> list[list[tuple[Tensor, Tensor]]]:
+def halves(tmp_path_factory: pytest.TempPathFactory) -> list[list[Any]]:
     folder = tmp_path_factory.mktemp("halves")
     torch.multiprocessing.spawn(half, (str(folder),), nprocs=2)  # pyright: ignore[reportPrivateImportUsage]
     return [torch.load(folder / f"{rank}.pt") for rank in range(2)]
 
 
+def test_a_metric_is_over_the_sessions_of_all_processes(halves: list[list[Any]]):
+    alone = PoseErrorMetric()
+    for count in (1, 2):
+        alone.update(*errors_of(count))
+    for found in halves:
+        assert found[2] == alone.compute()
+
+
 @pytest.mark.parametrize("case", [0, 1], ids=["all sessions converge", "all sessions of one process fail"])
-def test_two_processes_are_one(halves: list[list[tuple[Tensor, Tensor]]], case: int):
+def test_two_processes_are_one(halves: list[list[Any]], case: int):
     (loss_0, gradient_0), (loss_1, gradient_1) = (half[case] for half in halves)
     alone = Corrected()
     loss = alone([keypoints, sessions_with_failures][case]())

@@ -114,7 +114,8 @@ class LayerResult:
     @staticmethod
     def of_tensors(tensors: Mapping[str, Any], status: Sequence[str]) -> LayerResult:
         """A result of what :meth:`tensors` gives, and the status of each session."""
-        return LayerResult(**dict.fromkeys(_TENSORS) | dict(tensors), status=tuple(status))
+        every: dict[str, Any] = dict.fromkeys(_TENSORS)
+        return LayerResult(**every | dict(tensors), status=tuple(status))
 
     def each(self, function: Callable[[Tensor], Tensor]) -> LayerResult:
         """A result made of this one, tensor by tensor."""

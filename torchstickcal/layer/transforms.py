@@ -13,6 +13,7 @@ from typing import Any, NoReturn, ParamSpec, TypeVar
 
 import torch
 from torch import Tensor
+from torch._C._functorch import is_functorch_wrapped_tensor
 from torch.autograd import forward_ad
 from torch.utils import _pytree as pytree
 
@@ -49,7 +50,7 @@ def calibrated_in_any_transform(calibrated: Callable[[LayerInputs], LayerResult]
 def is_transformed(value: Any) -> bool:
     """Whether a transform of torch.func has wrapped a tensor of a pytree."""
     leaves = (leaf for leaf in pytree.tree_leaves(value) if isinstance(leaf, Tensor))
-    return any(torch._C._functorch.is_functorch_wrapped_tensor(leaf) for leaf in leaves)
+    return any(is_functorch_wrapped_tensor(leaf) for leaf in leaves)
 
 
 def outside_graphs(function: Callable[_Arguments, _Result]) -> Callable[_Arguments, _Result]:
