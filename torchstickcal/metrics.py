@@ -32,12 +32,12 @@ class PoseErrors:
     @property
     def mean_rotation_deg(self) -> float:
         """Mean over the cameras."""
-        return float(self.rotation_deg.mean())
+        return float(self.rotation_deg.detach().mean())
 
     @property
     def mean_translation_m(self) -> float:
         """Mean over the cameras."""
-        return float(self.translation_m.mean())
+        return float(self.translation_m.detach().mean())
 
 
 def pose_errors(
