@@ -14,6 +14,9 @@ from importlib import resources
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
+import torch
+from torch import Tensor
+
 from torchstickcal.errors import ConfigError
 from torchstickcal.files import parse_toml
 from torchstickcal.losses import LOSSES, CameraPointLoss, LossSettings, ReprojectionSettings
@@ -148,6 +151,13 @@ class Config:
     camera_groups: list[str] = field(default_factory=list)
     synchronise: bool = True
     max_offset_s: Positive = 2.0
+    noise: Literal["estimated", "given"] = "estimated"
+    sigma_px: Positive | list[Positive] = 1.0
+
+    @property
+    def given_sigma_px(self) -> Tensor | None:
+        """The given standard deviations of the keypoints, one number or (P,), pixels; None where they are estimated."""
+        return None if self.noise == "estimated" else torch.tensor(self.sigma_px, dtype=torch.float64)
 
 
 def config_names() -> list[str]:

@@ -26,32 +26,49 @@ _MIN_VARIANCE_RATIO = 0.01
 
 
 def estimate_sigma_px(measurements: Measurements, squared_residuals: Tensor) -> Tensor:
-    """Standard deviation of the keypoints along an image axis, for each point, (B, P), pixels.
+    """Standard deviation of the keypoints along an image axis, for each point, (B, P), pixels: of :func:`sigma_px_of`."""
+    return sigma_px_of(measurements, squared_residuals, near_keypoints(measurements, squared_residuals))
 
-    It is the root mean square of the residuals below 2.5 standard deviations, corrected for this cut and for the three degrees
-    of freedom of each 3D point. The estimates of different points are then shrunk towards their common mean (empirical Bayes on
-    the log variances). If their differences can be explained by chance, all points get the same value. Of a long session, 2000
-    evenly spaced frames are used.
+
+def near_keypoints(measurements: Measurements, squared_residuals: Tensor) -> Tensor:
+    """The keypoints that take part in the estimate of the noise: those with residuals below 3.5 standard deviations.
+
+    Of a long session, 2000 evenly spaced frames are looked at.
 
     Args:
         measurements: the sessions.
         squared_residuals: from :meth:`Measurements.squared_residuals`, (B, C, N).
+
+    Returns:
+        A mask (B, C, F', P) of the frames that are looked at.
     """
-    frames = torch.linspace(0, measurements.frames - 1, min(measurements.frames, _MAX_FRAMES)).round().long()
-    visible = measurements.by_frame(measurements.visible)[:, :, frames]
-    squared = measurements.by_frame(squared_residuals)[:, :, frames].double()
+    squared = _of_some_frames(measurements, squared_residuals)
+    visible = _of_some_frames(measurements, measurements.visible)
     variance, views = _initial_variance(squared, visible), visible.sum(1)
-    moments = _truncated_moments(measurements.num_cameras).to(squared)
-    for _ in range(_ITERATIONS):
-        inliers = visible & (squared <= (_CUT**2 * variance[:, None] * _remaining_share(views))[:, None])
-        inliers = inliers & (inliers.sum(1, keepdim=True) >= 2)
-        views = inliers.sum(1)
-        by_point = (2 * views - 3).clamp_min(0)
-        degrees_of_freedom = by_point.sum(1).to(squared)
-        expected = (by_point * moments[views]).sum(1).clamp_min(moments[2])
-        variance = squared.where(inliers, 0.0).sum((1, 2)) / expected
-        variance = _shrink(variance.clamp_min(_MIN_SIGMA_PX**2), degrees_of_freedom)
-    return variance.sqrt()
+    near = visible
+    for iteration in range(_ITERATIONS):
+        if iteration:
+            variance = _variance(squared, near, measurements.num_cameras)
+        near = visible & (squared <= (_CUT**2 * variance[:, None] * _remaining_share(views))[:, None])
+        near = near & (near.sum(1, keepdim=True) >= 2)
+        views = near.sum(1)
+    return near
+
+
+def sigma_px_of(measurements: Measurements, squared_residuals: Tensor, near: Tensor) -> Tensor:
+    """Standard deviation of the keypoints along an image axis, for each point, (B, P), pixels. Differentiable.
+
+    It is that of a keypoint of confidence 1: the root mean square of the residuals of the keypoints that take part, corrected
+    for the cut and for the three degrees of freedom of each 3D point. The estimates of different points are then shrunk towards
+    their common mean (empirical Bayes on the log variances). If their differences can be explained by chance, all points get
+    the same value.
+
+    Args:
+        measurements: the sessions.
+        squared_residuals: from :meth:`Measurements.squared_residuals`, (B, C, N).
+        near: the keypoints that take part, from :func:`near_keypoints`.
+    """
+    return _variance(_of_some_frames(measurements, squared_residuals), near, measurements.num_cameras).sqrt()
 
 
 def estimate_acceleration_m(measurements: Measurements, points: Tensor, point_variance: Tensor) -> Tensor:
@@ -74,6 +91,23 @@ def estimate_acceleration_m(measurements: Measurements, points: Tensor, point_va
     variance = ((measured - expected) * weights).sum(1) / total
     detectable = _MIN_VARIANCE_RATIO * complete.sum(1) / total
     return torch.maximum(variance, detectable).clamp_min(_MIN_ACCELERATION_M**2).sqrt()
+
+
+def _of_some_frames(measurements: Measurements, columns: Tensor) -> Tensor:
+    """A tensor (B, C, N) by frame, (B, C, F', P), of the frames that are looked at; numbers in float64."""
+    by_frame = measurements.by_frame(columns)
+    if measurements.frames > _MAX_FRAMES:
+        by_frame = by_frame[:, :, torch.linspace(0, measurements.frames - 1, _MAX_FRAMES).round().long()]
+    return by_frame.double() if by_frame.is_floating_point() else by_frame
+
+
+def _variance(squared: Tensor, near: Tensor, cameras: int) -> Tensor:
+    """Variance of the keypoints (B, P), from squared residuals of those that take part, both (B, C, F', P)."""
+    by_point = (2 * near.sum(1) - 3).clamp_min(0)
+    moments = _truncated_moments(cameras).to(squared)
+    expected = (by_point * moments[near.sum(1)]).sum(1).clamp_min(moments[2])
+    variance = squared.where(near, 0.0).sum((1, 2)) / expected
+    return _shrink(variance.clamp_min(_MIN_SIGMA_PX**2), by_point.sum(1).to(squared))
 
 
 def _initial_variance(squared: Tensor, visible: Tensor) -> Tensor:
