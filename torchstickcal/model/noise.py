@@ -10,7 +10,7 @@ from torchstickcal.losses.track import combined, consecutive
 from torchstickcal.model.measurements import Measurements
 from torchstickcal.model.shrinkage import shrunk_logarithms
 
-_CUT = 3.5
+NEAR_SIGMAS = 3.5
 """Residual, in standard deviations, beyond which a keypoint takes no part in the estimate of the noise. With a wide cut,
 outliers raise the estimate, it lets more of them in, and stays at several times the noise."""
 _ITERATIONS = 4
@@ -48,14 +48,16 @@ def near_keypoints(measurements: Measurements, squared_residuals: Tensor) -> Ten
     near = visible
     for iteration in range(_ITERATIONS):
         if iteration:
-            variance = _variance(squared, near, measurements.num_cameras)
-        near = visible & (squared <= (_CUT**2 * variance[:, None] * _remaining_share(views))[:, None])
+            variance = _variance(squared, near, measurements.num_cameras, NEAR_SIGMAS)
+        near = visible & (squared <= (NEAR_SIGMAS**2 * variance[:, None] * _remaining_share(views))[:, None])
         near = near & (near.sum(1, keepdim=True) >= 2)
         views = near.sum(1)
     return near
 
 
-def sigma_px_of(measurements: Measurements, squared_residuals: Tensor, near: Tensor) -> Tensor:
+def sigma_px_of(
+    measurements: Measurements, squared_residuals: Tensor, taking_part: Tensor, cut: float = NEAR_SIGMAS
+) -> Tensor:
     """Standard deviation of the keypoints along an image axis, for each point, (B, P), pixels. Differentiable.
 
     It is that of a keypoint of confidence 1: the root mean square of the residuals of the keypoints that take part, corrected
@@ -66,9 +68,12 @@ def sigma_px_of(measurements: Measurements, squared_residuals: Tensor, near: Ten
     Args:
         measurements: the sessions.
         squared_residuals: from :meth:`Measurements.squared_residuals`, (B, C, N).
-        near: the keypoints that take part, from :func:`near_keypoints`.
+        taking_part: the keypoints that take part, from :func:`near_keypoints`, or (B, C, N).
+        cut: residual, in standard deviations, up to which they do.
     """
-    return _variance(_of_some_frames(measurements, squared_residuals), near, measurements.num_cameras).sqrt()
+    squared = _of_some_frames(measurements, squared_residuals)
+    mask = taking_part if taking_part.ndim == 4 else _of_some_frames(measurements, taking_part)
+    return _variance(squared, mask, measurements.num_cameras, cut).sqrt()
 
 
 def estimate_acceleration_m(measurements: Measurements, points: Tensor, point_variance: Tensor) -> Tensor:
@@ -101,10 +106,10 @@ def _of_some_frames(measurements: Measurements, columns: Tensor) -> Tensor:
     return by_frame.double() if by_frame.is_floating_point() else by_frame
 
 
-def _variance(squared: Tensor, near: Tensor, cameras: int) -> Tensor:
-    """Variance of the keypoints (B, P), from squared residuals of those that take part, both (B, C, F', P)."""
+def _variance(squared: Tensor, near: Tensor, cameras: int, cut: float) -> Tensor:
+    """Variance of the keypoints (B, P), from squared residuals below a cut: of those that take part, both (B, C, F', P)."""
     by_point = (2 * near.sum(1) - 3).clamp_min(0)
-    moments = _truncated_moments(cameras).to(squared)
+    moments = _truncated_moments(cameras, cut).to(squared)
     expected = (by_point * moments[near.sum(1)]).sum(1).clamp_min(moments[2])
     variance = squared.where(near, 0.0).sum((1, 2)) / expected
     return _shrink(variance.clamp_min(_MIN_SIGMA_PX**2), by_point.sum(1).to(squared))
@@ -131,10 +136,10 @@ def _remaining_share(views: Tensor) -> Tensor:
     return (2 * views - 3).clamp_min(1) / (2 * views).clamp_min(4)
 
 
-def _truncated_moments(cameras: int) -> Tensor:
+def _truncated_moments(cameras: int, cut: float) -> Tensor:
     """Second moments of residuals below the cut, as fractions of the full moments, by the number of views from 0 to C."""
     half = _degrees(cameras) / 2
-    limit = half * _CUT**2 / 2
+    limit = half * cut**2 / 2
     return torch.special.gammainc(half + 1, limit) / torch.special.gammainc(half, limit)
 
 

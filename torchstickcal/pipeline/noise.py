@@ -46,11 +46,28 @@ class NoiseLevels(NamedTuple):
 
 
 @dataclass(frozen=True)
+class Chosen:
+    """Keypoints from which their noise is estimated.
+
+    Args:
+        mask: (B, C, N), or as of :func:`torchstickcal.model.noise.near_keypoints`.
+        cut: residual, in standard deviations, up to which they were chosen.
+    """
+
+    mask: Tensor
+    cut: float
+
+    def sigma_px(self, given: Measurements, squared_residuals: Tensor) -> Tensor:
+        """The standard deviation of the keypoints, (B, P), pixels; arguments as of :func:`sigma_px_of`."""
+        return sigma_px_of(given, squared_residuals, self.mask, self.cut)
+
+
+@dataclass(frozen=True)
 class NoiseGates:
     """What was decided when the noise was estimated."""
 
-    near: Tensor
-    """(B, C, F', P), the keypoints that take part in the estimate of the noise"""
+    chosen: Chosen
+    """the keypoints from which the noise is estimated"""
     correlation: CorrelationGates | None
     """None where no loss asks for how long errors last"""
 
@@ -58,7 +75,9 @@ class NoiseGates:
         """The decisions with some sessions (B,), True where, taken from another."""
         mine, theirs = self.correlation, other.correlation
         correlation = None if mine is None or theirs is None else mine.replaced(where, theirs)
-        return NoiseGates(torch.where(where[:, None, None, None], other.near, self.near), correlation)
+        mask, new = self.chosen.mask, other.chosen.mask
+        chosen = Chosen(torch.where(where.view(-1, *[1] * (mask.ndim - 1)), new, mask), self.chosen.cut)
+        return NoiseGates(chosen, correlation)
 
 
 @dataclass(frozen=True)
@@ -79,20 +98,33 @@ class StageNoise:
         wanted = [name for loss in self.stage.losses.values() for name, value in vars(loss).items() if value == _ESTIMATED]
         return any(name != _SIGMA_PX or self.given_sigma_px is None for name in wanted)
 
+    def chosen(self, kept: Measurements, near: Chosen) -> Chosen:
+        """From which keypoints the noise is estimated once no more are rejected: those that take part in the stage.
+
+        While it is not yet known which keypoints are wrong, a narrow cut keeps them from raising the estimate. Afterwards a wide
+        one is better: few keypoints are near it, and each that crosses it is a jump.
+
+        Args:
+            kept: the keypoints that take part in the stage.
+            near: those that a narrow cut leaves.
+        """
+        rejects = self.stage.reject_sigmas
+        return near if rejects is None else Chosen(kept.visible, rejects)
+
     def decided(
-        self, kept: Measurements, state: State, sigma_px: Tensor, near: Tensor
+        self, kept: Measurements, state: State, squared_residuals: Tensor, chosen: Chosen
     ) -> tuple[dict[str, Loss], NoiseLevels, NoiseGates]:
         """The stage's losses at a state, their noise, and what was decided about it.
 
         Args:
             kept: the keypoints that take part in the stage.
             state: where the errors are looked at.
-            sigma_px: the estimated noise of the keypoints, (B, P).
-            near: the keypoints from which it was estimated.
+            squared_residuals: of all keypoints at the state.
+            chosen: the keypoints from which their noise is estimated.
         """
-        found = _Levels(kept, state, sigma_px)
+        found = _Levels(kept, state, chosen.sigma_px(kept, squared_residuals))
         losses = self._losses(kept, found.sigma_px, found.correlation_frames, found.acceleration_m)
-        return losses, found.levels, NoiseGates(near, found.gates)
+        return losses, found.levels, NoiseGates(chosen, found.gates)
 
     def levels(self, given: Measurements, kept: Measurements, state: State, gates: NoiseGates) -> NoiseLevels:
         """The noise at a state with all decisions held; differentiable by state and measurements.
@@ -103,7 +135,7 @@ class StageNoise:
             state: where the errors are looked at.
             gates: what was decided.
         """
-        sigma_px = sigma_px_of(given, given.squared_residuals(state), gates.near)
+        sigma_px = gates.chosen.sigma_px(given, given.squared_residuals(state))
         found = _Levels(kept, state, sigma_px, gates)
         self._losses(kept, found.sigma_px, found.correlation_frames, found.acceleration_m)
         return found.levels

@@ -8,9 +8,9 @@ from dataclasses import replace
 import torch
 
 from torchstickcal.losses import Quadratic, TrackLoss
-from torchstickcal.model.noise import near_keypoints, sigma_px_of
+from torchstickcal.model.noise import NEAR_SIGMAS, near_keypoints
 from torchstickcal.pipeline.adjust import Adjustment
-from torchstickcal.pipeline.noise import HeldNoise
+from torchstickcal.pipeline.noise import Chosen, HeldNoise
 from torchstickcal.pipeline.run import Run
 from torchstickcal.pipeline.scale import rulers, scale_factors
 
@@ -36,8 +36,8 @@ def settle_noise(adjustment: Adjustment, run: Run) -> Adjustment:
         return adjustment
     measurements, kept, at = adjustment.measurements, adjustment.kept, last.minimum
     squared = measurements.squared_residuals(at)
-    near = near_keypoints(measurements, squared)
-    *_, gates = noise.decided(kept, at, sigma_px_of(measurements, squared, near), near)
+    near = Chosen(near_keypoints(measurements, squared), NEAR_SIGMAS)
+    *_, gates = noise.decided(kept, at, squared, noise.chosen(kept, near))
     held = HeldNoise(noise, gates, last.inliers)
     minimum = held.minimum_near(measurements, at)
     state = minimum.state
@@ -48,5 +48,5 @@ def settle_noise(adjustment: Adjustment, run: Run) -> Adjustment:
     settled = last._replace(state=state, minimum=minimum.state, losses=minimum.objective.losses, noise=levels, gates=gates)
     run.took(_SETTLE, time.perf_counter() - began)
     failed = torch.tensor([any(record.stop.failed for record in records) for records in adjustment.records])
-    settled = settled.replaced(failed.to(state.points.device), last)
+    settled = settled.replaced(failed.to(state.points.device), last._replace(gates=gates))
     return replace(adjustment, state=settled.state, results=(settled,))

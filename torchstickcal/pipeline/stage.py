@@ -12,10 +12,10 @@ from torch import Tensor
 from torchstickcal.config import Stage
 from torchstickcal.losses import Loss
 from torchstickcal.model.measurements import Measurements
-from torchstickcal.model.noise import near_keypoints, sigma_px_of
+from torchstickcal.model.noise import NEAR_SIGMAS, near_keypoints
 from torchstickcal.model.objective import Objective
 from torchstickcal.model.state import State
-from torchstickcal.pipeline.noise import NoiseGates, NoiseLevels
+from torchstickcal.pipeline.noise import Chosen, NoiseGates, NoiseLevels
 from torchstickcal.pipeline.run import Run
 from torchstickcal.pipeline.scale import rulers, scale_factors
 from torchstickcal.solvers import StageRecord, Stop, Termination, solver
@@ -86,14 +86,16 @@ def run_stage(
     """
     began, given = time.perf_counter(), measurements
     squared_residuals = measurements.squared_residuals(state)
-    near = near_keypoints(measurements, squared_residuals)
-    sigma_px = sigma_px_of(measurements, squared_residuals, near)
+    near = Chosen(near_keypoints(measurements, squared_residuals), NEAR_SIGMAS)
+    sigma_px = near.sigma_px(measurements, squared_residuals)
     if stage.reject_sigmas is not None:
         limits = (stage.reject_sigmas * sigma_px).square().to(squared_residuals)
         agreeing = measurements.by_frame(squared_residuals) <= limits[:, None, None]
         measurements = measurements.keeping(agreeing.flatten(2))
+    noise = run.noise_of(stage)
+    chosen = near if stage.cameras == "free" else noise.chosen(measurements, near)
+    losses, levels, gates = noise.decided(measurements, state, squared_residuals, chosen)
     del squared_residuals
-    losses, levels, gates = run.noise_of(stage).decided(measurements, state, sigma_px, near)
     objective = Objective(measurements, losses)
     outcome = solver(run.config.solver)(
         objective,
