@@ -131,6 +131,10 @@ class Config:
         synchronise: whether ``auto`` may estimate clocks.
         max_offset_s: largest time offset from the first camera that is searched for, seconds. Where the motion repeats itself,
             choose less than half its period.
+        noise: whether losses whose ``sigma_px`` is ``estimated`` take it from the session, or what is ``given`` here. The choice
+            of outliers always goes by the estimate.
+        sigma_px: standard deviation of a keypoint of confidence 1 along each axis, pixels, where the noise is given: one number,
+            or a list with one for each point.
 
     Example:
         >>> config = load_config({"extends": "default", "stages": {"metric": {"stick_length": {"sigma_m": 0.003}}}})
@@ -156,7 +160,7 @@ class Config:
 
     @property
     def given_sigma_px(self) -> Tensor | None:
-        """The given standard deviations of the keypoints, one number or (P,), pixels; None where they are estimated."""
+        """The given standard deviations of the keypoints, () or (P,), pixels; None where they are estimated."""
         return None if self.noise == "estimated" else torch.tensor(self.sigma_px, dtype=torch.float64)
 
 
@@ -196,6 +200,15 @@ def load_config(config: str | Path | Mapping[str, Any] | Config = "default") -> 
     if not built.stages:
         raise ConfigError("nothing to do", where=f"{where}: stages", got="no stage", expected="at least one")
     return built
+
+
+def with_noise(config: Config, noise: Any) -> Config:
+    """A configuration whose noise is ``estimated`` or ``given``.
+
+    Raises:
+        ConfigError: if it is to be neither.
+    """
+    return dataclasses.replace(config, noise=build(typing.get_type_hints(Config)["noise"], noise, "argument", ("noise",)))
 
 
 def with_refine(config: Config, refine: Any) -> Config:

@@ -20,6 +20,7 @@ from torchstickcal.model.unknowns import RigUnknowns, clock_refinements, with_re
 from torchstickcal.observations import Observations
 from torchstickcal.pipeline.focal_search import search_focal
 from torchstickcal.pipeline.initialise import initialise, triangulated
+from torchstickcal.pipeline.noise import check_noise
 from torchstickcal.pipeline.relabel import Labels, mended
 from torchstickcal.pipeline.run import Run
 from torchstickcal.pipeline.scale import check_scale, rulers
@@ -221,7 +222,8 @@ def begin(
         start: an earlier estimate; None to estimate the rig from nothing.
 
     Raises:
-        ConfigError: if nothing sets the scale, and if there are camera groups, but not a label for each camera.
+        ConfigError: if nothing sets the scale, if there are camera groups, but not a label for each camera, and if the noise of
+            another number of points is given.
         ObservationError: if no two cameras have a frame in common.
         RigError: if the cameras cannot be placed in one rig.
     """
@@ -229,6 +231,7 @@ def begin(
     config, frames = run.config, on_common_frames(observations, offsets_frames)
     seen = measured(frames, config)
     check_scale(seen, rulers(seen, config))
+    check_noise(config, seen.points_per_frame)
     if start is not None:
         state = _state_of(start, seen, config)
     elif observations.intrinsics_known:

@@ -13,7 +13,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from torchstickcal.config import Stage
+from torchstickcal.config import Config, Stage
+from torchstickcal.errors import ConfigError
 from torchstickcal.losses import Loss, LossContext, LossSettings, TrackLoss
 from torchstickcal.model.correlation import CorrelationGates, error_correlation
 from torchstickcal.model.measurements import Measurements
@@ -223,6 +224,22 @@ class _Levels:
             variance = objective.point_variance(self._state)
         self.levels = self.levels._replace(acceleration_m=estimate_acceleration_m(self._kept, self._state.points, variance))
         return self.levels.acceleration_m
+
+
+def check_noise(config: Config, points: int) -> None:
+    """Refuse given noise of another number of points than a session has.
+
+    Raises:
+        ConfigError: if it is.
+    """
+    given = config.given_sigma_px
+    if given is not None and given.ndim and len(given) != points:
+        raise ConfigError(
+            "the given noise is of another number of points",
+            where="config.sigma_px",
+            got=f"{len(given)} numbers",
+            expected=f"one number, or {points}: one for each point",
+        )
 
 
 def _is_track(named: tuple[str, LossSettings]) -> bool:
