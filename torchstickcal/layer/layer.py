@@ -21,7 +21,6 @@ from torchstickcal.pipeline.adjust import Adjustment, adjust_cameras, adjust_poi
 from torchstickcal.pipeline.attach import attach_gradients
 from torchstickcal.pipeline.relabel import Labels
 from torchstickcal.pipeline.run import Run
-from torchstickcal.pipeline.settle import settle_noise
 from torchstickcal.precision import full_precision
 from torchstickcal.solvers.gradients import GradientMode, gradient_mode
 from torchstickcal.stick import Stick, located_sticks
@@ -156,7 +155,7 @@ class CalibrationLayer(nn.Module):
     def _solved(self, given: LayerInputs, begun: Adjustment, run: Run, only_last: bool) -> LayerResult:
         """Sessions adjusted side by side, their last stages with gradients by what was given."""
         with torch.no_grad():
-            ended = adjust_points(settle_noise(adjust_cameras(begun, run, only_last), run), run)
+            ended = adjust_points(adjust_cameras(begun, run, only_last), run, roughly=True)
         data = given.relabelled(ended.labels).measurements(
             ended.seen, ended.measurements, self._refined, self.config.camera_groups
         )

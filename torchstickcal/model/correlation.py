@@ -188,9 +188,7 @@ def _freedom_share(m: Measurements) -> Tensor:
     return free / m.by_frame(2 * views).sum(1).clamp_min(1)
 
 
-def _pooled(
-    products: Tensor, pairs: Tensor, widths: Tensor, held: Tensor | None
-) -> tuple[Tensor, Tensor, Tensor]:
+def _pooled(products: Tensor, pairs: Tensor, widths: Tensor, held: Tensor | None) -> tuple[Tensor, Tensor, Tensor]:
     """The correlation of all points together by bin that chance does not explain, (B, bins), and its integrated time (B, 1);
     also in which bins there is such a correlation, (B, bins).
 

@@ -132,7 +132,9 @@ class Measurements:
             self,
             pixels=self.pixels.detach(),
             confidence=self.confidence.detach(),
-            cameras=replace(self.cameras, matrix=self.cameras.matrix.detach(), distortion=None if lens is None else lens.detach()),
+            cameras=replace(
+                self.cameras, matrix=self.cameras.matrix.detach(), distortion=None if lens is None else lens.detach()
+            ),
             lengths_m=self.lengths_m.detach(),
             unknowns=replace(self.unknowns, prior_sigma=self.unknowns.prior_sigma.detach()),
         )

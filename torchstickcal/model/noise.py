@@ -55,9 +55,7 @@ def near_keypoints(measurements: Measurements, squared_residuals: Tensor) -> Ten
     return near
 
 
-def sigma_px_of(
-    measurements: Measurements, squared_residuals: Tensor, taking_part: Tensor, cut: float = NEAR_SIGMAS
-) -> Tensor:
+def sigma_px_of(measurements: Measurements, squared_residuals: Tensor, taking_part: Tensor, cut: float = NEAR_SIGMAS) -> Tensor:
     """Standard deviation of the keypoints along an image axis, for each point, (B, P), pixels. Differentiable.
 
     It is that of a keypoint of confidence 1: the root mean square of the residuals of the keypoints that take part, corrected

@@ -36,7 +36,14 @@ def attach_gradients(ended: Adjustment, data: Measurements, run: Run, mode: Grad
         kept = replace(data, confidence=data.confidence.where(result.inliers, 0.0))
         fixed = None if result.stage.cameras == "free" else state if number else result.minimum
         levels = _levels(held, result, data, fixed if number else None)
-        state = attach(held, data, _minimum(held, data.detached(), result, fixed, levels), mode, fixed, levels)
+        state = attach(
+            held,
+            data,
+            _minimum(held, data.detached(), result, fixed, levels, ended.measurements.pixels.dtype),
+            mode,
+            fixed,
+            levels,
+        )
         if result.stage.rescale:
             factors, _ = scale_factors(kept, state.points, rulers(kept, run.config))
             state = state.scaled(factors)
@@ -62,11 +69,27 @@ def _levels(held: HeldNoise, result: StageResult, data: Measurements, before: St
 
 @torch.no_grad()
 def _minimum(
-    held: HeldNoise, data: Measurements, result: StageResult, fixed: State | None, levels: NoiseLevels | None
+    held: HeldNoise,
+    data: Measurements,
+    result: StageResult,
+    fixed: State | None,
+    levels: NoiseLevels | None,
+    precision: torch.dtype,
 ) -> Linearised:
-    """A stage's minimum, to rounding: a gradient is as exact as the minimum at which it is taken."""
+    """A stage's minimum, to rounding: a gradient is as exact as the minimum at which it is taken.
+
+    Args:
+        held: the noise of the stage.
+        data: the measurements.
+        result: where the stage ended.
+        fixed: the state with its cameras, where they were held fixed.
+        levels: of the noise; None where they are those at the minimum, and both have been found together.
+        precision: in which the stage was run.
+    """
     if levels is None:
-        return held.minimum_near(data, result.minimum)
+        if precision != torch.float64:
+            return held.minimum_near(data, result.minimum)[0]
+        return Linearised(held.objective(data, result.noise), result.minimum, cameras_free=True)
     objective = held.objective(data, levels)
     start = result.minimum if fixed is None else replace(fixed, points=result.minimum.points)
-    return minimum_near(lambda _: objective, start, cameras_free=fixed is None)
+    return minimum_near(lambda _: objective, start, cameras_free=fixed is None)[0]

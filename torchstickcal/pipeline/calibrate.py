@@ -16,7 +16,6 @@ from torchstickcal.pipeline.check import CameraCheck
 from torchstickcal.pipeline.conclude import conclude
 from torchstickcal.pipeline.run import Run
 from torchstickcal.pipeline.selection import ModelSelection
-from torchstickcal.pipeline.settle import settle_noise
 from torchstickcal.result import Calibration
 from torchstickcal.solvers import IterationRecord, ignore_record
 from torchstickcal.workers import on_worker
@@ -98,7 +97,7 @@ def _calibrated(observations: Observations, config: Config, callback: Callback |
         adjusted, check = models.refined_where_contradicted(adjusted, check)
 
     # 5. Trajectories: with the cameras fixed, smooth each point as its noise and its motion demand.
-    ended = adjust_points(settle_noise(adjusted, run), run)
+    ended = adjust_points(adjusted, run)
 
     # 6. Conclude: covariance, warnings, and the result in the caller's dtype.
     unsynchronised = config.synchronise and "time_offset" not in ended.refined and models.unsynchronised

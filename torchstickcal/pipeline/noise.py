@@ -145,7 +145,9 @@ class StageNoise:
         """The stage's losses with some noise; differentiable by it."""
 
         def correlation_frames(given: float | str) -> Tensor:
-            return levels.correlation_frames if given == _ESTIMATED else torch.full_like(levels.correlation_frames, float(given))
+            return (
+                levels.correlation_frames if given == _ESTIMATED else torch.full_like(levels.correlation_frames, float(given))
+            )
 
         return self._losses(kept, levels.sigma_px, correlation_frames, lambda _: levels.acceleration_m)
 
@@ -159,9 +161,7 @@ class StageNoise:
         """The losses. Track losses come last: their sigma may be estimated with the others at hand."""
         losses: dict[str, Loss] = {}
         used_px = sigma_px if self.given_sigma_px is None else self.given_sigma_px.to(sigma_px).expand_as(sigma_px)
-        context = LossContext(
-            kept.point_index, kept.stick_sigma_m, used_px, correlation_frames, lambda: acceleration_m(losses)
-        )
+        context = LossContext(kept.point_index, kept.stick_sigma_m, used_px, correlation_frames, lambda: acceleration_m(losses))
         for name, settings in sorted(self.stage.losses.items(), key=_is_track):
             losses[name] = settings.build(context)
         return losses
@@ -190,8 +190,8 @@ class HeldNoise:
         kept = self._kept(measurements)
         return Objective(kept, self.noise.losses(kept, NoiseLevels(*levels)))
 
-    def minimum_near(self, measurements: Measurements, state: State) -> Linearised:
-        """The minimum whose own noise the objective reckons with, near a state."""
+    def minimum_near(self, measurements: Measurements, state: State) -> tuple[Linearised, Tensor]:
+        """The minimum whose own noise the objective reckons with, near a state, and in which sessions it was found, (B,)."""
         return minimum_near(lambda at: self.objective(measurements, self.levels(measurements, at)), state, cameras_free=True)
 
     def _kept(self, measurements: Measurements) -> Measurements:

@@ -37,6 +37,12 @@ class Run:
         """The noise that a stage reckons with."""
         return StageNoise(stage, self.config.given_sigma_px)
 
+    @property
+    def settles(self) -> bool:
+        """Whether the last camera stage takes its noise from the data, so that both have to be brought to agree."""
+        *_, stage = self.camera_stages.values()
+        return stage.cameras == "free" and self.noise_of(stage).estimated
+
     def took(self, step: str, seconds: float) -> None:
         """Add to the time of a step."""
         self.seconds[step] = self.seconds.get(step, 0.0) + seconds

@@ -3,50 +3,46 @@
 from __future__ import annotations
 
 import time
-from dataclasses import replace
 
 import torch
+from torch import Tensor
 
-from torchstickcal.losses import Quadratic, TrackLoss
+from torchstickcal.model.measurements import Measurements
 from torchstickcal.model.noise import NEAR_SIGMAS, near_keypoints
-from torchstickcal.pipeline.adjust import Adjustment
 from torchstickcal.pipeline.noise import Chosen, HeldNoise
 from torchstickcal.pipeline.run import Run
 from torchstickcal.pipeline.scale import rulers, scale_factors
+from torchstickcal.pipeline.stage import StageResult
 
 _SETTLE = "settle"
 
 
 @torch.no_grad()
-def settle_noise(adjustment: Adjustment, run: Run) -> Adjustment:
-    """Sessions after their last camera stage, with the noise as it is found where that stage has ended.
+def settled(measurements: Measurements, result: StageResult, run: Run) -> tuple[StageResult, Tensor]:
+    """A stage that estimated cameras, with the noise as it is found where the stage ends.
 
-    A stage reckons with the noise that was found where it began. That is a little different from the noise where it ends. So
-    both are brought to agree, with the keypoints that take part and all other decisions held. Nothing is done where the stage
-    takes nothing from the data, or where the Hessian is not known exactly.
+    A stage reckons with the noise that was found where it began. That is a little different from the noise where it ends. Here
+    both are brought to agree, with the keypoints that take part and all other decisions held.
 
     Args:
-        adjustment: where the sessions have ended.
+        measurements: the sessions.
+        result: where the stage has ended, or nearly.
         run: what all steps share.
+
+    Returns:
+        The result, and in which sessions it was found, (B,). Others may be anywhere on the way.
     """
-    began, last = time.perf_counter(), adjustment.last_camera_stage
-    noise = run.noise_of(last.stage)
-    tracks = [loss for loss in last.losses.values() if isinstance(loss, TrackLoss)]
-    if last.stage.cameras == "held" or not noise.estimated or not all(isinstance(loss.kernel, Quadratic) for loss in tracks):
-        return adjustment
-    measurements, kept, at = adjustment.measurements, adjustment.kept, last.minimum
-    squared = measurements.squared_residuals(at)
+    began, noise, at = time.perf_counter(), run.noise_of(result.stage), result.minimum
+    kept, squared = measurements.keeping(result.inliers), measurements.squared_residuals(at)
     near = Chosen(near_keypoints(measurements, squared), NEAR_SIGMAS)
     *_, gates = noise.decided(kept, at, squared, noise.chosen(kept, near))
-    held = HeldNoise(noise, gates, last.inliers)
-    minimum = held.minimum_near(measurements, at)
-    state = minimum.state
-    if last.stage.rescale:
+    held = HeldNoise(noise, gates, result.inliers)
+    found, converged = held.minimum_near(measurements, at)
+    state = found.state
+    if result.stage.rescale:
         factors, _ = scale_factors(kept, state.points, rulers(kept, run.config))
         state = state.scaled(factors)
-    levels = held.levels(measurements, minimum.state)
-    settled = last._replace(state=state, minimum=minimum.state, losses=minimum.objective.losses, noise=levels, gates=gates)
+    levels = held.levels(measurements, found.state)
     run.took(_SETTLE, time.perf_counter() - began)
-    failed = torch.tensor([any(record.stop.failed for record in records) for records in adjustment.records])
-    settled = settled.replaced(failed.to(state.points.device), last._replace(gates=gates))
-    return replace(adjustment, state=settled.state, results=(settled,))
+    losses = found.objective.losses
+    return result._replace(state=state, minimum=found.state, losses=losses, noise=levels, gates=gates), converged

@@ -22,6 +22,8 @@ from torchstickcal.solvers import StageRecord, Stop, Termination, solver
 
 _RESOLUTION = {torch.float64: 0.0, torch.float32: 1e-6}
 """Relative decrease of the cost that can be told from rounding."""
+_ROUGHLY = 1e-3
+"""Relative decrease of the cost from which on a state is near the minimum."""
 _LEAST_AGREEING_SHARE = 0.15
 """Share of a camera's keypoints that must agree with the other cameras. Sound cameras have more than 0.8, cameras that see
 another scene 0.3 to 0.4; by chance some always agree."""
@@ -74,6 +76,7 @@ def run_stage(
     measurements: Measurements,
     state: State,
     run: Run,
+    roughly: bool = False,
 ) -> StageResult:
     """Run one stage from a state, for all sessions.
 
@@ -83,6 +86,7 @@ def run_stage(
         measurements: the sessions.
         state: where it starts.
         run: what all steps share.
+        roughly: whether it is enough to come near the minimum.
     """
     began, given = time.perf_counter(), measurements
     squared_residuals = measurements.squared_residuals(state)
@@ -97,11 +101,12 @@ def run_stage(
     losses, levels, gates = noise.decided(measurements, state, squared_residuals, chosen)
     del squared_residuals
     objective = Objective(measurements, losses)
+    least = _ROUGHLY if roughly and run.config.solver == "gauss_newton" else _RESOLUTION[measurements.pixels.dtype]
     outcome = solver(run.config.solver)(
         objective,
         state,
         cameras_free=stage.cameras == "free",
-        termination=Termination(stage.max_iterations, max(stage.cost_tolerance, _RESOLUTION[measurements.pixels.dtype])),
+        termination=Termination(stage.max_iterations, max(stage.cost_tolerance, least)),
         stage=name,
         listener=run.listener,
     )

@@ -271,9 +271,7 @@ class _Levels:
         return [a + b.to(a) for a, b in zip(direct, through, strict=False)]
 
 
-def _derivatives(
-    of: Tensor | Sequence[Tensor], by: Sequence[Tensor], weights: Sequence[Tensor] | None = None
-) -> list[Tensor]:
+def _derivatives(of: Tensor | Sequence[Tensor], by: Sequence[Tensor], weights: Sequence[Tensor] | None = None) -> list[Tensor]:
     return list(torch.autograd.grad(of, by, weights, retain_graph=True, allow_unused=True, materialize_grads=True))
 
 

@@ -19,6 +19,8 @@ from torchstickcal.solvers.linearised import Linearised, gradient_at
 _MAX_ROUNDS = 40
 _STEP_SIGMAS = {torch.float64: 1e-9, torch.float32: 1e-3}
 """Length of a step, in standard deviations of the estimate, below which a session has converged, by the dtype of the pixels."""
+_CONVERGED_SIGMAS = 1e-2
+"""The same, below which it has converged as far as rounding allows."""
 _FRESH_ROUNDS = 2
 """Steps with a Hessian of their own. Those after them use the last one: what they still have to go is short."""
 _SLOW, _OLD = 0.3, 3
@@ -33,16 +35,19 @@ def polish(objective: Objective, state: State, cameras_free: bool) -> State:
         state: the result of a solver.
         cameras_free: whether all cameras but the first are unknowns too.
     """
-    return minimum_near(lambda _: objective, state, cameras_free).state
+    return minimum_near(lambda _: objective, state, cameras_free)[0].state
 
 
-def minimum_near(objective_at: Callable[[State], Objective], state: State, cameras_free: bool) -> Linearised:
+def minimum_near(objective_at: Callable[[State], Objective], state: State, cameras_free: bool) -> tuple[Linearised, Tensor]:
     """The state near another that minimises the objective that belongs to it, with that objective.
 
     Args:
         objective_at: the objective with the noise that is found at a state; otherwise as of :func:`polish`.
         state: the result of a solver.
         cameras_free: whether all cameras but the first are unknowns too.
+
+    Returns:
+        The objective at its minimum, and in which sessions that was found, (B,).
     """
     best = trial = state
     at, acceleration = Linearised(objective_at(trial), trial, cameras_free), Acceleration()
@@ -75,6 +80,7 @@ def minimum_near(objective_at: Callable[[State], Objective], state: State, camer
             gradient = at.gradient
         else:
             gradient, age = gradient_at(objective, trial, cameras_free), age + 1
+    converged = shortest < _CONVERGED_SIGMAS
     if at.state is best:
-        return at
-    return Linearised(objective if trial is best else objective_at(best), best, cameras_free)
+        return at, converged
+    return Linearised(objective if trial is best else objective_at(best), best, cameras_free), converged
