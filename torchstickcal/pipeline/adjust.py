@@ -340,11 +340,11 @@ def _settled(adjustment: Adjustment, run: Run) -> Adjustment:
     """
     if not run.settles:
         return adjustment
-    result, found = settled(adjustment.measurements, adjustment.last, run)
+    *_, (name, stage) = run.camera_stages.items()
+    result, found = settled(name, adjustment.measurements, adjustment.last, run)
     if not bool(found.all()):
-        *_, (name, stage) = run.camera_stages.items()
         ended = run_stage(name, stage, adjustment.measurements, adjustment.state, run)
-        again = adjustment.ended(settled(adjustment.measurements, ended, run)[0])
+        again = adjustment.ended(settled(name, adjustment.measurements, ended, run)[0])
         return again.replaced(found, replace(adjustment, state=result.state, results=(result,)))
     return replace(adjustment, state=result.state, results=(result,))
 

@@ -99,7 +99,7 @@ class StageNoise:
         wanted = [name for loss in self.stage.losses.values() for name, value in vars(loss).items() if value == _ESTIMATED]
         return any(name != _SIGMA_PX or self.given_sigma_px is None for name in wanted)
 
-    def chosen(self, kept: Measurements, near: Chosen) -> Chosen:
+    def chosen(self, kept: Measurements, near: Callable[[], Chosen]) -> Chosen:
         """From which keypoints the noise is estimated once no more are rejected: those that take part in the stage.
 
         While it is not yet known which keypoints are wrong, a narrow cut keeps them from raising the estimate. Afterwards a wide
@@ -107,10 +107,10 @@ class StageNoise:
 
         Args:
             kept: the keypoints that take part in the stage.
-            near: those that a narrow cut leaves.
+            near: gives those that a narrow cut leaves.
         """
         rejects = self.stage.reject_sigmas
-        return near if rejects is None else Chosen(kept.visible, rejects)
+        return near() if rejects is None else Chosen(kept.visible, rejects)
 
     def decided(
         self, kept: Measurements, state: State, squared_residuals: Tensor, chosen: Chosen

@@ -14,17 +14,16 @@ from torchstickcal.pipeline.run import Run
 from torchstickcal.pipeline.scale import rulers, scale_factors
 from torchstickcal.pipeline.stage import StageResult
 
-_SETTLE = "settle"
-
 
 @torch.no_grad()
-def settled(measurements: Measurements, result: StageResult, run: Run) -> tuple[StageResult, Tensor]:
+def settled(name: str, measurements: Measurements, result: StageResult, run: Run) -> tuple[StageResult, Tensor]:
     """A stage that estimated cameras, with the noise as it is found where the stage ends.
 
     A stage reckons with the noise that was found where it began. That is a little different from the noise where it ends. Here
     both are brought to agree, with the keypoints that take part and all other decisions held.
 
     Args:
+        name: of the stage.
         measurements: the sessions.
         result: where the stage has ended, or nearly.
         run: what all steps share.
@@ -34,7 +33,10 @@ def settled(measurements: Measurements, result: StageResult, run: Run) -> tuple[
     """
     began, noise, at = time.perf_counter(), run.noise_of(result.stage), result.minimum
     kept, squared = measurements.keeping(result.inliers), measurements.squared_residuals(at)
-    near = Chosen(near_keypoints(measurements, squared), NEAR_SIGMAS)
+
+    def near() -> Chosen:
+        return Chosen(near_keypoints(measurements, squared), NEAR_SIGMAS)
+
     *_, gates = noise.decided(kept, at, squared, noise.chosen(kept, near))
     held = HeldNoise(noise, gates, result.inliers)
     found, converged = held.minimum_near(measurements, at)
@@ -43,6 +45,6 @@ def settled(measurements: Measurements, result: StageResult, run: Run) -> tuple[
         factors, _ = scale_factors(kept, state.points, rulers(kept, run.config))
         state = state.scaled(factors)
     levels = held.levels(measurements, found.state)
-    run.took(_SETTLE, time.perf_counter() - began)
+    run.took(name, time.perf_counter() - began)
     losses = found.objective.losses
     return result._replace(state=state, minimum=found.state, losses=losses, noise=levels, gates=gates), converged

@@ -97,7 +97,7 @@ def run_stage(
         agreeing = measurements.by_frame(squared_residuals) <= limits[:, None, None]
         measurements = measurements.keeping(agreeing.flatten(2))
     noise = run.noise_of(stage)
-    chosen = near if stage.cameras == "free" else noise.chosen(measurements, near)
+    chosen = near if stage.cameras == "free" else noise.chosen(measurements, lambda: near)
     losses, levels, gates = noise.decided(measurements, state, squared_residuals, chosen)
     del squared_residuals
     objective = Objective(measurements, losses)

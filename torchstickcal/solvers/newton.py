@@ -14,17 +14,15 @@ from torch import Tensor
 from torchstickcal.model.objective import Objective
 from torchstickcal.model.state import State
 from torchstickcal.solvers.acceleration import Acceleration
-from torchstickcal.solvers.linearised import Linearised, gradient_at
+from torchstickcal.solvers.linearised import Linearised, Tangent, gradient_at
 
 _MAX_ROUNDS = 40
-_STEP_SIGMAS = {torch.float64: 1e-9, torch.float32: 1e-3}
+_STEP_SIGMAS = {torch.float64: 1e-8, torch.float32: 1e-3}
 """Length of a step, in standard deviations of the estimate, below which a session has converged, by the dtype of the pixels."""
 _CONVERGED_SIGMAS = 1e-2
 """The same, below which it has converged as far as rounding allows."""
-_FRESH_ROUNDS = 2
-"""Steps with a Hessian of their own. Those after them use the last one: what they still have to go is short."""
 _SLOW, _OLD = 0.3, 3
-"""Ratio of the lengths of two steps, and number of steps, from which on the Hessian is built anew."""
+"""Ratio of the lengths of two steps, and number of steps with one Hessian, from which on it is built anew."""
 
 
 def polish(objective: Objective, state: State, cameras_free: bool) -> State:
@@ -39,7 +37,9 @@ def polish(objective: Objective, state: State, cameras_free: bool) -> State:
 
 
 def minimum_near(objective_at: Callable[[State], Objective], state: State, cameras_free: bool) -> tuple[Linearised, Tensor]:
-    """The state near another that minimises the objective that belongs to it, with that objective.
+    """The state near another that minimises the objective that belongs to it, and that objective there.
+
+    The Hessian is built once, and again only if the steps do not quickly become shorter: the way is short.
 
     Args:
         objective_at: the objective with the noise that is found at a state; otherwise as of :func:`polish`.
@@ -55,9 +55,9 @@ def minimum_near(objective_at: Callable[[State], Objective], state: State, camer
     tolerance = _STEP_SIGMAS[objective.measurements.pixels.dtype]
     shortest = torch.full_like(state.points[:, 0, 0], torch.inf)
     moving = torch.ones_like(shortest, dtype=torch.bool)
-    for number in range(1, _MAX_ROUNDS + 1):
+    for _ in range(_MAX_ROUNDS):
         step = at.solve(gradient)
-        length = step.dot(gradient).clamp_min(0.0).sqrt()
+        length = _length(step, gradient, tolerance)
         shorter = length < shortest
         slow = bool((moving & ~(length < _SLOW * shortest)).any())
         if not back:
@@ -75,7 +75,7 @@ def minimum_near(objective_at: Callable[[State], Objective], state: State, camer
             cameras, unknowns, points = step.like(moved)
             trial = best.replaced(moving, best.retracted(cameras, points, unknowns))
         objective, age_of_step = objective_at(trial), age
-        if back or number < _FRESH_ROUNDS or (slow and age >= _OLD):
+        if back or (slow and age >= _OLD):
             at, age = Linearised(objective, trial, cameras_free), 0
             gradient = at.gradient
         else:
@@ -84,3 +84,13 @@ def minimum_near(objective_at: Callable[[State], Objective], state: State, camer
     if at.state is best:
         return at, converged
     return Linearised(objective if trial is best else objective_at(best), best, cameras_free), converged
+
+
+def _length(step: Tangent, gradient: Tangent, least: float) -> Tensor:
+    """Lengths of Newton steps in standard deviations of the estimate, (B,).
+
+    They are infinite where the Hessian is not positive definite, so that the step leads nowhere.
+    """
+    squared = step.dot(gradient)
+    nowhere = (squared < -(least**2)) | ((squared == 0) & (gradient.dot(gradient) > 0))
+    return squared.clamp_min(0.0).sqrt().where(~nowhere, torch.inf)
