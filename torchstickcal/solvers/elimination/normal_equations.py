@@ -369,7 +369,7 @@ class NormalEquations:
 
     def _eliminated_parts(self) -> Iterator[tuple[Part, _EliminatedPart]]:
         """All parts, eliminated: from the cache, or computed again."""
-        if self._cache is None and not self._free_cameras:
+        if not self._cache and not self._free_cameras:
             self._cache = [self._eliminate(part) for part in self._parts]
         for index, part in enumerate(self._parts):
             yield part, self._cache[index] if self._cache else self._eliminate(part)
