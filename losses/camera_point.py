@@ -210,7 +210,7 @@ class CameraPointLoss(Loss, ABC):
     def point_information(
         self, points_cam: Tensor, rotations: Tensor, pixels: Tensor, information: Tensor, cameras: Intrinsics
     ) -> Tensor:
-        """The Gauss-Newton blocks J^T J by the points, summed over the cameras, (..., 6, N); differentiable by all that is given.
+        """The Gauss-Newton blocks J^T J by the points, summed over the cameras, (..., 6, N); differentiable by all arguments.
 
         The arguments are those of :meth:`linearise`.
         """

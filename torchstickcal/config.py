@@ -131,10 +131,10 @@ class Config:
         synchronise: whether ``auto`` may estimate clocks.
         max_offset_s: largest time offset from the first camera that is searched for, seconds. Where the motion repeats itself,
             choose less than half its period.
-        noise: whether losses whose ``sigma_px`` is ``estimated`` take it from the session, or what is ``given`` here. The choice
-            of outliers always goes by the estimate.
-        sigma_px: standard deviation of a keypoint of confidence 1 along each axis, pixels, where the noise is given: one number,
-            or a list with one for each point.
+        noise: whether losses whose ``sigma_px`` is ``estimated`` take it from the session, or from what is ``given`` here. The
+            choice of outliers always goes by the estimate.
+        sigma_px: where the noise is given, the standard deviation along each axis of a keypoint of confidence 1, pixels: one
+            number, or a list with one for each point.
 
     Example:
         >>> config = load_config({"extends": "default", "stages": {"metric": {"stick_length": {"sigma_m": 0.003}}}})

@@ -36,10 +36,9 @@ class Observations:
         sticks: one stick or several; empty if the scale comes from elsewhere.
         distortion: (C, D), or one (D,) for all, OpenCV's order, D of 4, 5, 8, 12 or 14; None for perfect lenses. Rows and
             columns as OpenCV returns them, (1, D), (D, 1), (C, 1, D) and (C, D, 1), are accepted too.
-        confidence: (C, F, P) in [0, 1], the weight of a keypoint relative to the other keypoints of its point: the variance of a
-            keypoint is that of the point's noise, divided by its confidence. A factor on all confidences of a point changes
-            almost nothing where the noise is estimated. 0 means not seen, and so does less than 1/10000 of the session's
-            largest: such a keypoint would be a hundred times as uncertain as the best.
+        confidence: (C, F, P) in [0, 1], the weight of a keypoint relative to the noise of its point: the variance of a keypoint
+            is the point's, divided by the keypoint's confidence. 0 means not seen, and so does 1/10000 of the session's largest
+            confidence or less: such a keypoint would be a hundred times as uncertain as the best.
         image_size: width and height in pixels, (C, 2) or (2,).
         fps: frames per second.
         point_names: P names. camera_names: C names.

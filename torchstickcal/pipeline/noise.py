@@ -102,8 +102,8 @@ class StageNoise:
     def chosen(self, kept: Measurements, near: Callable[[], Chosen]) -> Chosen:
         """From which keypoints the noise is estimated once no more are rejected: those that take part in the stage.
 
-        While it is not yet known which keypoints are wrong, a narrow cut keeps them from raising the estimate. Afterwards a wide
-        one is better: few keypoints are near it, and each that crosses it is a jump.
+        While it is not yet known which keypoints are wrong, a narrow cut keeps them from raising the estimate. Afterwards a
+        wide one is better: a keypoint that crosses the cut is a jump, and few keypoints are near a wide one.
 
         Args:
             kept: the keypoints that take part in the stage.

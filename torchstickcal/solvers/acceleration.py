@@ -1,6 +1,6 @@
 """Fixed-point iterations, accelerated by what their earlier steps have shown (Anderson's method).
 
-The steps ``f`` of an iteration are, near its end, linear in the distance to it. So the combination of the last few steps that is
+Near the end of an iteration its steps are linear in the distance to the end. So the combination of the last few steps that is
 shortest says how far to go. On a linear iteration the method is equivalent to GMRES.
 
 Reference: Walker and Ni, "Anderson acceleration for fixed-point iterations", 2011.
