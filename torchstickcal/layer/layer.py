@@ -155,7 +155,7 @@ class CalibrationLayer(nn.Module):
     def _solved(self, given: LayerInputs, begun: Adjustment, run: Run, only_last: bool) -> LayerResult:
         """Sessions adjusted side by side, their last stages with gradients by what was given."""
         with torch.no_grad():
-            ended = adjust_points(adjust_cameras(begun, run, only_last), run, roughly=True)
+            ended = adjust_points(adjust_cameras(begun, run, only_last), run, to_rounding=True)
         data = given.relabelled(ended.labels).measurements(
             ended.seen, ended.measurements, self._refined, self.config.camera_groups
         )

@@ -7,7 +7,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
 
 import torch
@@ -24,7 +24,7 @@ from torchstickcal.pipeline.noise import check_noise
 from torchstickcal.pipeline.relabel import Labels, mended
 from torchstickcal.pipeline.run import Run
 from torchstickcal.pipeline.scale import check_scale, rulers
-from torchstickcal.pipeline.settle import settled
+from torchstickcal.pipeline.settle import polished, settled
 from torchstickcal.pipeline.stage import StageResult, agreeing_cameras, run_stage
 from torchstickcal.pipeline.synchronise import (
     CLOCK_STAGE,
@@ -299,15 +299,19 @@ def adjust_again(adjustment: Adjustment, run: Run, refined: Sequence[str]) -> Ad
     return _with_last_camera_stage(_through(before, begun, run), run)
 
 
-def adjust_points(adjustment: Adjustment, run: Run, roughly: bool = False) -> Adjustment:
+def adjust_points(adjustment: Adjustment, run: Run, to_rounding: bool = False) -> Adjustment:
     """The stages in which the cameras are fixed.
 
     Args:
         adjustment: sessions whose cameras are estimated.
         run: what all steps share.
-        roughly: whether it is enough to come near the minima.
+        to_rounding: whether each stage is taken to its minimum up to rounding errors.
     """
-    return _through(run.point_stages.items(), adjustment, run, roughly)
+    for named in run.point_stages.items():
+        before, adjustment = adjustment, _through([named], adjustment, run, roughly=to_rounding)
+        if to_rounding:
+            adjustment = _finished(adjustment, run, named, before.state, polished)
+    return adjustment
 
 
 def measured(frames: CommonFrames, config: Config) -> Measurements:
@@ -340,13 +344,35 @@ def _settled(adjustment: Adjustment, run: Run) -> Adjustment:
     """
     if not run.settles:
         return adjustment
-    *_, (name, stage) = run.camera_stages.items()
-    result, found = settled(name, adjustment.measurements, adjustment.last, run)
-    if not bool(found.all()):
-        ended = run_stage(name, stage, adjustment.measurements, adjustment.state, run)
-        again = adjustment.ended(settled(name, adjustment.measurements, ended, run)[0])
-        return again.replaced(found, replace(adjustment, state=result.state, results=(result,)))
-    return replace(adjustment, state=result.state, results=(result,))
+    *_, last = run.camera_stages.items()
+    return _finished(adjustment, run, last, adjustment.state, settled)
+
+
+def _finished(
+    adjustment: Adjustment,
+    run: Run,
+    named: tuple[str, Stage],
+    begin_at: State,
+    finish: Callable[[str, Measurements, StageResult, Run], tuple[StageResult, Tensor]],
+) -> Adjustment:
+    """With the last stage taken to where a function takes it.
+
+    Args:
+        adjustment: sessions that have come near that.
+        run: what all steps share.
+        named: the last stage.
+        begin_at: where the stage begins again, for sessions in which the function has not found what it looks for.
+        finish: the function; it also says in which sessions it has found it.
+    """
+    name, stage = named
+    result, found = finish(name, adjustment.measurements, adjustment.last, run)
+    earlier = adjustment.results[:-1]
+    finished = replace(adjustment, state=result.state, results=(*earlier, result))
+    if bool(found.all()):
+        return finished
+    ended = run_stage(name, stage, adjustment.measurements, begin_at, run)
+    result, _ = finish(name, adjustment.measurements, ended, run)
+    return replace(adjustment, results=earlier).ended(result).replaced(found, finished)
 
 
 def _through(stages: Iterable[tuple[str, Stage]], adjustment: Adjustment, run: Run, roughly: bool = False) -> Adjustment:

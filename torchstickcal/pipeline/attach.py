@@ -31,20 +31,14 @@ def attach_gradients(ended: Adjustment, data: Measurements, run: Run, mode: Grad
         mode: how the gradients are computed.
     """
     state = ended.state
+    at_minima = run.settles and ended.measurements.pixels.dtype == torch.float64
     for number, result in enumerate(ended.results):
         held = HeldNoise(run.noise_of(result.stage), result.gates, result.inliers)
-        kept = replace(data, confidence=data.confidence.where(result.inliers, 0.0))
         fixed = None if result.stage.cameras == "free" else state if number else result.minimum
         levels = _levels(held, result, data, fixed if number else None)
-        state = attach(
-            held,
-            data,
-            _minimum(held, data.detached(), result, fixed, levels, ended.measurements.pixels.dtype),
-            mode,
-            fixed,
-            levels,
-        )
+        state = attach(held, data, _minimum(held, data.detached(), result, fixed, levels, at_minima), mode, fixed, levels)
         if result.stage.rescale:
+            kept = replace(data, confidence=data.confidence.where(result.inliers, 0.0))
             factors, _ = scale_factors(kept, state.points, rulers(kept, run.config))
             state = state.scaled(factors)
     failed = torch.tensor([any(record.stop.failed for record in records) for records in ended.records])
@@ -74,7 +68,7 @@ def _minimum(
     result: StageResult,
     fixed: State | None,
     levels: NoiseLevels | None,
-    precision: torch.dtype,
+    at_minimum: bool,
 ) -> Linearised:
     """A stage's minimum, to rounding: a gradient is as exact as the minimum at which it is taken.
 
@@ -84,12 +78,12 @@ def _minimum(
         result: where the stage ended.
         fixed: the state with its cameras, where they were held fixed.
         levels: of the noise; None where they are those at the minimum, and both have been found together.
-        precision: in which the stage was run.
+        at_minimum: whether the stage has ended there.
     """
-    if levels is None:
-        if precision != torch.float64:
-            return held.minimum_near(data, result.minimum)[0]
-        return Linearised(held.objective(data, result.noise), result.minimum, cameras_free=True)
-    objective = held.objective(data, levels)
     start = result.minimum if fixed is None else replace(fixed, points=result.minimum.points)
+    if levels is None and not at_minimum:
+        return held.minimum_near(data, start)[0]
+    objective = held.objective(data, result.noise if levels is None else levels)
+    if at_minimum:
+        return Linearised(objective, start, cameras_free=fixed is None)
     return minimum_near(lambda _: objective, start, cameras_free=fixed is None)[0]

@@ -1,4 +1,4 @@
-"""Cameras and noise that agree: the cameras are the minimum for the noise that is found there."""
+"""Stages taken to their minima up to rounding errors, and cameras and noise that agree."""
 
 from __future__ import annotations
 
@@ -9,10 +9,13 @@ from torch import Tensor
 
 from torchstickcal.model.measurements import Measurements
 from torchstickcal.model.noise import NEAR_SIGMAS, near_keypoints
+from torchstickcal.model.objective import Objective
 from torchstickcal.pipeline.noise import Chosen, HeldNoise
 from torchstickcal.pipeline.run import Run
 from torchstickcal.pipeline.scale import rulers, scale_factors
 from torchstickcal.pipeline.stage import StageResult
+from torchstickcal.solvers.linearised import Linearised
+from torchstickcal.solvers.newton import minimum_near
 
 
 @torch.no_grad()
@@ -40,11 +43,25 @@ def settled(name: str, measurements: Measurements, result: StageResult, run: Run
     *_, gates = noise.decided(kept, at, squared, noise.chosen(kept, near))
     held = HeldNoise(noise, gates, result.inliers)
     found, converged = held.minimum_near(measurements, at)
-    state = found.state
-    if result.stage.rescale:
-        factors, _ = scale_factors(kept, state.points, rulers(kept, run.config))
-        state = state.scaled(factors)
     levels = held.levels(measurements, found.state)
     run.took(name, time.perf_counter() - began)
-    losses = found.objective.losses
-    return result._replace(state=state, minimum=found.state, losses=losses, noise=levels, gates=gates), converged
+    return _with_minimum(result, found, run)._replace(noise=levels, gates=gates), converged
+
+
+@torch.no_grad()
+def polished(name: str, measurements: Measurements, result: StageResult, run: Run) -> tuple[StageResult, Tensor]:
+    """A stage at its minimum, with the noise that it began with; otherwise as :func:`settled`."""
+    began, free = time.perf_counter(), result.stage.cameras == "free"
+    objective = Objective(measurements.keeping(result.inliers), result.losses)
+    found, converged = minimum_near(lambda _: objective, result.minimum, free)
+    run.took(name, time.perf_counter() - began)
+    return _with_minimum(result, found, run), converged
+
+
+def _with_minimum(result: StageResult, found: Linearised, run: Run) -> StageResult:
+    """The result with another minimum, brought to scale where the stage does so."""
+    state, m = found.state, found.objective.measurements
+    if result.stage.rescale:
+        factors, _ = scale_factors(m, state.points, rulers(m, run.config))
+        state = state.scaled(factors)
+    return result._replace(state=state, minimum=found.state, losses=found.objective.losses)

@@ -316,8 +316,7 @@ def _adjoint(minimum: Linearised, mode: GradientMode, gradient: Tangent, objecti
 
 def _where_nonzero(adjoint: Tangent, gradient: Tensor) -> Tensor:
     """A gradient (B, ...), exactly zero for sessions whose adjoint is zero: 0 times infinity may have made it NaN there."""
-    nonzero = torch.stack([part.flatten(1).any(1) for part in adjoint]).any(0)
-    return gradient.where(nonzero.view(-1, *[1] * (gradient.ndim - 1)), 0.0)
+    return gradient.where(adjoint.nonzero.view(-1, *[1] * (gradient.ndim - 1)), 0.0)
 
 
 def _with_data(measurements: Measurements, data: Sequence[Tensor | None]) -> Measurements:

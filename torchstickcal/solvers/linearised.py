@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import pad
 
+from torchstickcal.geometry.symmetric import are_definite
 from torchstickcal.model.objective import Objective
 from torchstickcal.model.state import State
 from torchstickcal.solvers.elimination.normal_equations import NormalEquations
@@ -40,6 +41,11 @@ class Tangent(NamedTuple):
         """The same for some sessions (B,), True where kept; zero for the others."""
         return Tangent(*(part.where(kept.view(-1, *[1] * (part.ndim - 1)), 0.0) for part in self))
 
+    @property
+    def nonzero(self) -> Tensor:
+        """Whether any number is not zero, (B,)."""
+        return torch.stack([part.flatten(1).any(1) for part in self]).any(0)
+
     def flat(self) -> Tensor:
         """All numbers of each session side by side, (B, D)."""
         return torch.cat([part.flatten(1) for part in self], dim=1)
@@ -68,6 +74,17 @@ class Linearised:
         """Half the derivative of the objective."""
         system = self._system(exact=True)
         return Tangent(system.camera_gradient, system.unknown_gradient, system.point_gradient)
+
+    def descent(self, gradient: Tangent) -> Tangent:
+        """The Newton step that belongs to a gradient, with a minus sign.
+
+        Where the exact Hessian is not positive definite, Newton's step leads anywhere, and that of Gauss-Newton is taken.
+        """
+        step = self.solve(gradient)
+        definite = are_definite(self._system(exact=True).point_hessian) & ~((step.dot(gradient) <= 0) & gradient.nonzero)
+        if bool(definite.all()):
+            return step
+        return step.where(definite).plus(self.solve(gradient, exact=False).where(~definite))
 
     @torch.no_grad()
     def solve(self, gradient: Tangent, exact: bool = True) -> Tangent:

@@ -14,7 +14,7 @@ from torch import Tensor
 from torchstickcal.model.objective import Objective
 from torchstickcal.model.state import State
 from torchstickcal.solvers.acceleration import Acceleration
-from torchstickcal.solvers.linearised import Linearised, Tangent, gradient_at
+from torchstickcal.solvers.linearised import Linearised, gradient_at
 
 _MAX_ROUNDS = 40
 _STEP_SIGMAS = {torch.float64: 1e-8, torch.float32: 1e-3}
@@ -56,8 +56,8 @@ def minimum_near(objective_at: Callable[[State], Objective], state: State, camer
     shortest = torch.full_like(state.points[:, 0, 0], torch.inf)
     moving = torch.ones_like(shortest, dtype=torch.bool)
     for _ in range(_MAX_ROUNDS):
-        step = at.solve(gradient)
-        length = _length(step, gradient, tolerance)
+        step = at.descent(gradient)
+        length = step.dot(gradient).clamp_min(0.0).sqrt()
         shorter = length < shortest
         slow = bool((moving & ~(length < _SLOW * shortest)).any())
         if not back:
@@ -84,13 +84,3 @@ def minimum_near(objective_at: Callable[[State], Objective], state: State, camer
     if at.state is best:
         return at, converged
     return Linearised(objective if trial is best else objective_at(best), best, cameras_free), converged
-
-
-def _length(step: Tangent, gradient: Tangent, least: float) -> Tensor:
-    """Lengths of Newton steps in standard deviations of the estimate, (B,).
-
-    They are infinite where the Hessian is not positive definite, so that the step leads nowhere.
-    """
-    squared = step.dot(gradient)
-    nowhere = (squared < -(least**2)) | ((squared == 0) & (gradient.dot(gradient) > 0))
-    return squared.clamp_min(0.0).sqrt().where(~nowhere, torch.inf)
