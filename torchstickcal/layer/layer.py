@@ -128,7 +128,7 @@ class CalibrationLayer(nn.Module):
 
     def _calibrated(self, given: LayerInputs, initial: LayerResult | None) -> LayerResult:
         """All sessions; those that can be begun are solved side by side, a few at a time."""
-        device, run = given.keypoints.device, Run(self.config)
+        device, run = given.keypoints.device, Run(self.config, to_rounding=True)
 
         def begun(session: int) -> Adjustment | str:
             try:
@@ -155,7 +155,7 @@ class CalibrationLayer(nn.Module):
     def _solved(self, given: LayerInputs, begun: Adjustment, run: Run, only_last: bool) -> LayerResult:
         """Sessions adjusted side by side, their last stages with gradients by what was given."""
         with torch.no_grad():
-            ended = adjust_points(adjust_cameras(begun, run, only_last), run, to_rounding=True)
+            ended = adjust_points(adjust_cameras(begun, run, only_last), run)
         data = given.relabelled(ended.labels).measurements(
             ended.seen, ended.measurements, self._refined, self.config.camera_groups
         )

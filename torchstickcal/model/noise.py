@@ -40,7 +40,7 @@ def near_keypoints(measurements: Measurements, squared_residuals: Tensor) -> Ten
         squared_residuals: from :meth:`Measurements.squared_residuals`, (B, C, N).
 
     Returns:
-        A mask (B, C, F', P) of the frames that are looked at.
+        A mask (B, C, N), False in frames that are not looked at.
     """
     squared = _of_some_frames(measurements, squared_residuals)
     visible = _of_some_frames(measurements, measurements.visible)
@@ -52,7 +52,9 @@ def near_keypoints(measurements: Measurements, squared_residuals: Tensor) -> Ten
         near = visible & (squared <= (NEAR_SIGMAS**2 * variance[:, None] * _remaining_share(views))[:, None])
         near = near & (near.sum(1, keepdim=True) >= 2)
         views = near.sum(1)
-    return near
+    mask = torch.zeros_like(measurements.by_frame(measurements.visible))
+    mask[:, :, _frames_looked_at(measurements)] = near
+    return mask.flatten(2)
 
 
 def sigma_px_of(measurements: Measurements, squared_residuals: Tensor, taking_part: Tensor, cut: float = NEAR_SIGMAS) -> Tensor:
@@ -66,12 +68,11 @@ def sigma_px_of(measurements: Measurements, squared_residuals: Tensor, taking_pa
     Args:
         measurements: the sessions.
         squared_residuals: from :meth:`Measurements.squared_residuals`, (B, C, N).
-        taking_part: the keypoints that take part, from :func:`near_keypoints`, or (B, C, N).
+        taking_part: the keypoints that take part, (B, C, N), as from :func:`near_keypoints`.
         cut: residual, in standard deviations, up to which they do.
     """
     squared = _of_some_frames(measurements, squared_residuals)
-    mask = taking_part if taking_part.ndim == 4 else _of_some_frames(measurements, taking_part)
-    return _variance(squared, mask, measurements.num_cameras, cut).sqrt()
+    return _variance(squared, _of_some_frames(measurements, taking_part), measurements.num_cameras, cut).sqrt()
 
 
 def estimate_acceleration_m(measurements: Measurements, points: Tensor, point_variance: Tensor) -> Tensor:
@@ -96,11 +97,15 @@ def estimate_acceleration_m(measurements: Measurements, points: Tensor, point_va
     return torch.maximum(variance, detectable).clamp_min(_MIN_ACCELERATION_M**2).sqrt()
 
 
+def _frames_looked_at(measurements: Measurements) -> Tensor:
+    return torch.linspace(0, measurements.frames - 1, min(measurements.frames, _MAX_FRAMES)).round().long()
+
+
 def _of_some_frames(measurements: Measurements, columns: Tensor) -> Tensor:
     """A tensor (B, C, N) by frame, (B, C, F', P), of the frames that are looked at; numbers in float64."""
     by_frame = measurements.by_frame(columns)
     if measurements.frames > _MAX_FRAMES:
-        by_frame = by_frame[:, :, torch.linspace(0, measurements.frames - 1, _MAX_FRAMES).round().long()]
+        by_frame = by_frame[:, :, _frames_looked_at(measurements)]
     return by_frame.double() if by_frame.is_floating_point() else by_frame
 
 

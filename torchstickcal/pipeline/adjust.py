@@ -299,17 +299,11 @@ def adjust_again(adjustment: Adjustment, run: Run, refined: Sequence[str]) -> Ad
     return _with_last_camera_stage(_through(before, begun, run), run)
 
 
-def adjust_points(adjustment: Adjustment, run: Run, to_rounding: bool = False) -> Adjustment:
-    """The stages in which the cameras are fixed.
-
-    Args:
-        adjustment: sessions whose cameras are estimated.
-        run: what all steps share.
-        to_rounding: whether each stage is taken to its minimum up to rounding errors.
-    """
+def adjust_points(adjustment: Adjustment, run: Run) -> Adjustment:
+    """The stages in which the cameras are fixed."""
     for named in run.point_stages.items():
-        before, adjustment = adjustment, _through([named], adjustment, run, roughly=to_rounding)
-        if to_rounding:
+        before, adjustment = adjustment, _through([named], adjustment, run, roughly=run.to_rounding)
+        if run.to_rounding:
             adjustment = _finished(adjustment, run, named, before.state, polished)
     return adjustment
 
@@ -333,7 +327,7 @@ def points_used(observations: Observations, config: Config) -> list[int] | None:
 def _with_last_camera_stage(adjustment: Adjustment, run: Run) -> Adjustment:
     """After the last stage that estimates cameras, with clocks and noise that agree with what it found."""
     *_, last = run.camera_stages.items()
-    roughly = run.settles and not adjustment.asynchronous
+    roughly = run.to_rounding and run.settles and not adjustment.asynchronous
     return _settled(_synchronised(_through([last], adjustment, run, roughly), run), run)
 
 

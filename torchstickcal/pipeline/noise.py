@@ -51,7 +51,7 @@ class Chosen:
     """Keypoints from which their noise is estimated.
 
     Args:
-        mask: (B, C, N), or as of :func:`torchstickcal.model.noise.near_keypoints`.
+        mask: (B, C, N).
         cut: residual, in standard deviations, up to which they were chosen.
     """
 
@@ -76,9 +76,8 @@ class NoiseGates:
         """The decisions with some sessions (B,), True where, taken from another."""
         mine, theirs = self.correlation, other.correlation
         correlation = None if mine is None or theirs is None else mine.replaced(where, theirs)
-        mask, new = self.chosen.mask, other.chosen.mask
-        chosen = Chosen(torch.where(where.view(-1, *[1] * (mask.ndim - 1)), new, mask), self.chosen.cut)
-        return NoiseGates(chosen, correlation)
+        mask = torch.where(where[:, None, None], other.chosen.mask, self.chosen.mask)
+        return NoiseGates(Chosen(mask, other.chosen.cut), correlation)
 
 
 @dataclass(frozen=True)

@@ -17,11 +17,14 @@ class Run:
         config: the configuration.
         listener: hears every iteration.
         seconds: time by step, which the steps add to.
+        to_rounding: whether the last camera stage and those after it are taken to their minima up to rounding errors, as gradients
+            need it. Their solver then only has to come near.
     """
 
     config: Config
     listener: Listener = ignore_record
     seconds: dict[str, float] = field(default_factory=dict)
+    to_rounding: bool = False
 
     @property
     def camera_stages(self) -> dict[str, Stage]:

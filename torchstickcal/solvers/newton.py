@@ -14,11 +14,11 @@ from torch import Tensor
 from torchstickcal.model.objective import Objective
 from torchstickcal.model.state import State
 from torchstickcal.solvers.acceleration import Acceleration
-from torchstickcal.solvers.linearised import Linearised, gradient_at
+from torchstickcal.solvers.linearised import Linearised, Tangent, gradient_at
 
 _MAX_ROUNDS = 40
-_STEP_SIGMAS = {torch.float64: 1e-8, torch.float32: 1e-3}
-"""Length of a step, in standard deviations of the estimate, below which a session has converged, by the dtype of the pixels."""
+_STEP_SIGMAS = {torch.float64: 1e-7, torch.float32: 1e-3}
+"""Length of a step, in standard deviations of the estimate, below which it is the last, by the dtype of the pixels."""
 _CONVERGED_SIGMAS = 1e-2
 """The same, below which it has converged as far as rounding allows."""
 _SLOW, _OLD = 0.3, 3
@@ -63,7 +63,9 @@ def minimum_near(objective_at: Callable[[State], Objective], state: State, camer
         if not back:
             best = trial if bool((shorter | ~moving).all()) else best.replaced(moving & shorter, trial)
             shortest = torch.where(moving & shorter, length, shortest)
-            moving &= (shortest > tolerance) & (shorter if age_of_step == 0 else True)
+            ended = moving & (shortest <= tolerance)
+            best = best.replaced(ended, _moved(best, step, -1.0)) if bool(ended.any()) else best
+            moving &= ~ended & (shorter if age_of_step == 0 else True)
         if not bool(moving.any()):
             break
         # A step that has become longer is undone. It is tried again with a new Hessian, unless it had one.
@@ -72,8 +74,7 @@ def minimum_near(objective_at: Callable[[State], Objective], state: State, camer
             trial, acceleration = best, Acceleration()
         else:
             moved, _ = acceleration.step(-step.where(moving).flat(), -gradient.where(moving).flat())
-            cameras, unknowns, points = step.like(moved)
-            trial = best.replaced(moving, best.retracted(cameras, points, unknowns))
+            trial = best.replaced(moving, _moved(best, step.like(moved), 1.0))
         objective, age_of_step = objective_at(trial), age
         if back or (slow and age >= _OLD):
             at, age = Linearised(objective, trial, cameras_free), 0
@@ -81,6 +82,9 @@ def minimum_near(objective_at: Callable[[State], Objective], state: State, camer
         else:
             gradient, age = gradient_at(objective, trial, cameras_free), age + 1
     converged = shortest < _CONVERGED_SIGMAS
-    if at.state is best:
-        return at, converged
-    return Linearised(objective if trial is best else objective_at(best), best, cameras_free), converged
+    return Linearised(objective_at(best), best, cameras_free), converged
+
+
+def _moved(state: State, step: Tangent, factor: float) -> State:
+    """The state after so many times a step."""
+    return state.retracted(factor * step.cameras, factor * step.points, factor * step.unknowns)
