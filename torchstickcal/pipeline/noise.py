@@ -189,9 +189,13 @@ class HeldNoise:
         kept = self._kept(measurements)
         return Objective(kept, self.noise.losses(kept, NoiseLevels(*levels)))
 
-    def minimum_near(self, measurements: Measurements, state: State) -> tuple[Linearised, Tensor]:
+    def minimum_near(self, measurements: Measurements, state: State, to_rounding: bool = True) -> tuple[Linearised, Tensor]:
         """The minimum whose own noise the objective reckons with, near a state, and in which sessions it was found, (B,)."""
-        return minimum_near(lambda at: self.objective(measurements, self.levels(measurements, at)), state, cameras_free=True)
+
+        def objective_at(state: State) -> Objective:
+            return self.objective(measurements, self.levels(measurements, state))
+
+        return minimum_near(objective_at, state, cameras_free=True, to_rounding=to_rounding)
 
     def _kept(self, measurements: Measurements) -> Measurements:
         return replace(measurements, confidence=measurements.confidence.where(self.inliers, 0.0))

@@ -17,8 +17,8 @@ class Run:
         config: the configuration.
         listener: hears every iteration.
         seconds: time by step, which the steps add to.
-        to_rounding: whether the last camera stage and those after it are taken to their minima up to rounding errors, as gradients
-            need it. Their solver then only has to come near.
+        to_rounding: whether the last camera stage and those after it are taken to their minima up to rounding errors, for
+            gradients. Their solver then only has to come near.
     """
 
     config: Config

@@ -42,7 +42,7 @@ def settled(name: str, measurements: Measurements, result: StageResult, run: Run
 
     *_, gates = noise.decided(kept, at, squared, noise.chosen(kept, near))
     held = HeldNoise(noise, gates, result.inliers)
-    found, converged = held.minimum_near(measurements, at)
+    found, converged = held.minimum_near(measurements, at, run.to_rounding)
     levels = held.levels(measurements, found.state)
     run.took(name, time.perf_counter() - began)
     return _with_minimum(result, found, run)._replace(noise=levels, gates=gates), converged

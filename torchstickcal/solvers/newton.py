@@ -17,8 +17,9 @@ from torchstickcal.solvers.acceleration import Acceleration
 from torchstickcal.solvers.linearised import Linearised, Tangent, gradient_at
 
 _MAX_ROUNDS = 40
-_STEP_SIGMAS = {torch.float64: 1e-7, torch.float32: 1e-3}
-"""Length of a step, in standard deviations of the estimate, below which it is the last, by the dtype of the pixels."""
+_ROUNDING_SIGMAS, _NEAR_SIGMAS = 1e-7, 1e-3
+"""Length of a step, in standard deviations of the estimate, below which it is the last: for a minimum up to rounding errors, or
+near enough for everything but gradients, and as near as float32 allows."""
 _CONVERGED_SIGMAS = 1e-2
 """The same, below which it has converged as far as rounding allows."""
 _SLOW, _OLD = 0.3, 3
@@ -36,7 +37,9 @@ def polish(objective: Objective, state: State, cameras_free: bool) -> State:
     return minimum_near(lambda _: objective, state, cameras_free)[0].state
 
 
-def minimum_near(objective_at: Callable[[State], Objective], state: State, cameras_free: bool) -> tuple[Linearised, Tensor]:
+def minimum_near(
+    objective_at: Callable[[State], Objective], state: State, cameras_free: bool, to_rounding: bool = True
+) -> tuple[Linearised, Tensor]:
     """The state near another that minimises the objective that belongs to it, and that objective there.
 
     The Hessian is built once, and again only if the steps do not quickly become shorter: the way is short.
@@ -45,6 +48,7 @@ def minimum_near(objective_at: Callable[[State], Objective], state: State, camer
         objective_at: the objective with the noise that is found at a state; otherwise as of :func:`polish`.
         state: the result of a solver.
         cameras_free: whether all cameras but the first are unknowns too.
+        to_rounding: whether to go on up to rounding errors.
 
     Returns:
         The objective at its minimum, and in which sessions that was found, (B,).
@@ -52,7 +56,8 @@ def minimum_near(objective_at: Callable[[State], Objective], state: State, camer
     best = trial = state
     at, acceleration = Linearised(objective_at(trial), trial, cameras_free), Acceleration()
     objective, gradient, age, age_of_step, back = at.objective, at.gradient, 0, 0, False
-    tolerance = _STEP_SIGMAS[objective.measurements.pixels.dtype]
+    is_double = objective.measurements.pixels.dtype == torch.float64
+    tolerance = _ROUNDING_SIGMAS if to_rounding and is_double else _NEAR_SIGMAS
     shortest = torch.full_like(state.points[:, 0, 0], torch.inf)
     moving = torch.ones_like(shortest, dtype=torch.bool)
     for _ in range(_MAX_ROUNDS):
