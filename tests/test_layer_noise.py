@@ -13,7 +13,7 @@ from torchstickcal.losses import CameraPointLoss, FrameLoss
 from torchstickcal.model.objective import Objective
 from torchstickcal.pipeline.adjust import adjust_cameras, begin
 from torchstickcal.pipeline.run import Run
-from torchstickcal.simulate import Noise, golf_session, hockey_session
+from torchstickcal.simulate import Noise, golf_session
 from torchstickcal.solvers.acceleration import Acceleration
 from torchstickcal.solvers.elimination.normal_equations import NormalEquations
 
@@ -36,11 +36,10 @@ class Case(NamedTuple):
         return layer(inputs.keypoints, lens, inputs.lengths, inputs.confidence * inputs.of_points)
 
 
-def case(sport: str, lasting_px: float = 0.0, wrong: float = 0.0) -> Case:
+def case(seed: int, lasting_px: float = 0.0, wrong: float = 0.0) -> Case:
     """A session, with errors that last for some ten frames, and with a share of keypoints that are far off."""
-    session = {"golf": golf_session, "hockey": hockey_session}[sport]
     frames = 40 if lasting_px else 14
-    given, _ = session(cameras=4, frames=frames, noise=Noise(sigma_px=1.0, missing=0.05))
+    given, _ = golf_session(cameras=4, frames=frames, noise=Noise(sigma_px=1.0, missing=0.05), seed=seed)
     generator = torch.Generator().manual_seed(3)
 
     def normal(*shape: int) -> Tensor:
@@ -71,13 +70,13 @@ def readouts(result: LayerResult) -> list[Tensor]:
     return [along(result.rotations) + along(result.translations), along(result.points)]
 
 
-CASES = {"golf": case("golf"), "hockey, outliers": case("hockey", wrong=0.02), "errors that last": case("golf", lasting_px=3.0)}
+CASES = {"clean": case(0), "outliers": case(1, wrong=0.02), "errors that last": case(0, lasting_px=3.0)}
 
 
 @pytest.mark.parametrize("tried", CASES.values(), ids=CASES.keys())
 @pytest.mark.parametrize("noise", ["estimated", "given"])
 def test_gradients_of_the_whole_default(tried: Case, noise: str):
-    if noise == "given" and tried is not CASES["golf"]:
+    if noise == "given" and tried is not CASES["clean"]:
         pytest.skip("one session is enough")
     layer = CalibrationLayer(tried.given.sticks, noise=noise)  # pyright: ignore[reportArgumentType]
     leaves = Inputs(*(value.clone().requires_grad_() for value in tried.inputs))
@@ -108,26 +107,26 @@ def test_errors_that_last_do_so_here():
     assert ended.last.correlation_frames.max() > 2
 
 
-@pytest.mark.parametrize(("noise", "changes"), [("estimated", False), ("given", True)])
-def test_a_factor_on_the_confidences_of_a_point(noise: str, changes: bool):
-    tried = CASES["golf"]
-    layer = CalibrationLayer(tried.given.sticks, noise=noise)  # pyright: ignore[reportArgumentType]
-    factors = tried.inputs.of_points.clone().requires_grad_()
-    result = tried.run(layer, tried.inputs._replace(of_points=factors))
-    (by_factors,) = torch.autograd.grad(result.translations.norm(dim=-1).sum(), factors)
-    one = torch.zeros_like(factors)
+def test_a_factor_on_the_confidences_of_a_point():
+    tried, one, effects = CASES["clean"], torch.zeros_like(CASES["clean"].inputs.of_points), []
     one[4] = 0.1
-    with torch.no_grad():
-        before, after = (tried.run(layer, tried.inputs._replace(of_points=factors + sign * one)) for sign in (-1, 1))
-    expected = float((after.translations.norm(dim=-1) - before.translations.norm(dim=-1)).sum()) / 0.2
-    assert float(by_factors[4]) == pytest.approx(expected, rel=0.1)
-    assert (abs(expected) > 1e-4) == changes
+    for noise in ("estimated", "given"):
+        layer = CalibrationLayer(tried.given.sticks, noise=noise)
+        factors = tried.inputs.of_points.clone().requires_grad_()
+        result = tried.run(layer, tried.inputs._replace(of_points=factors))
+        (by_factors,) = torch.autograd.grad(result.translations.norm(dim=-1).sum(), factors)
+        with torch.no_grad():
+            before, after = (tried.run(layer, tried.inputs._replace(of_points=factors + sign * one)) for sign in (-1, 1))
+        expected = float((after.translations.norm(dim=-1) - before.translations.norm(dim=-1)).sum()) / 0.2
+        assert float(by_factors[4]) == pytest.approx(expected, rel=0.1)
+        effects.append(abs(expected))
+    assert effects[0] < 0.3 * effects[1]
 
 
 @pytest.mark.parametrize("sigma_px", [1.5, [0.5 + 0.1 * point for point in range(21)]])
 def test_given_noise_means_the_same_in_calibrate_and_in_the_layer(sigma_px: float | list[float]):
-    given, config = CASES["golf"].given, {"extends": "default", "sigma_px": sigma_px}
-    confidence = CASES["golf"].inputs.confidence
+    given, config = CASES["clean"].given, {"extends": "default", "sigma_px": sigma_px}
+    confidence = CASES["clean"].inputs.confidence
     observations = Observations(given.keypoints, given.intrinsics, given.sticks, given.distortion, confidence)
     expected = calibrate(observations, config, noise="given")
     result = CalibrationLayer(given.sticks, config, noise="given")(given.keypoints, given.cameras, confidence=confidence)
@@ -146,7 +145,7 @@ def test_given_noise_means_the_same_in_calibrate_and_in_the_layer(sigma_px: floa
 
 
 def test_noise_that_cannot_be_used_is_refused():
-    given = CASES["golf"].given
+    given = CASES["clean"].given
     with pytest.raises(ConfigError, match="noise"):
         CalibrationLayer(given.sticks, noise="known")  # pyright: ignore[reportArgumentType]
     with pytest.raises(ConfigError, match="noise"):
@@ -162,7 +161,7 @@ def test_noise_that_cannot_be_used_is_refused():
 @pytest.mark.parametrize("tiny", [1e-5, 1e-9, 1e-12, 1e-30])
 @pytest.mark.parametrize("largest", [1.0, 1e-3])
 def test_tiny_confidences_count_as_none(noise: str, tiny: float, largest: float):
-    given = CASES["golf"].given
+    given = CASES["clean"].given
     generator = torch.Generator().manual_seed(1)
     half = torch.rand(given.keypoints.shape[:-1], generator=generator) < 0.5
     found: list[tuple[LayerResult, Tensor]] = []
@@ -182,7 +181,7 @@ def test_tiny_confidences_count_as_none(noise: str, tiny: float, largest: float)
 
 
 def test_calibrate_has_the_same_bound():
-    given = CASES["golf"].given
+    given = CASES["clean"].given
     half = torch.arange(given.num_points) % 2 == 0
 
     def with_small(small: float) -> Tensor:
@@ -196,18 +195,8 @@ def test_calibrate_has_the_same_bound():
     assert not torch.equal(with_small(1e-3), with_small(0.0))
 
 
-def test_a_start_at_the_end_stays_there():
-    tried = CASES["golf"]
-    layer = CalibrationLayer(tried.given.sticks)
-    first = layer(tried.inputs.keypoints, tried.given.cameras)
-    second = layer(tried.inputs.keypoints, tried.given.cameras, initial=first)
-    torch.testing.assert_close(second.translations, first.translations, rtol=0, atol=1e-8)
-    torch.testing.assert_close(second.points, first.points, rtol=0, atol=1e-8)
-    torch.testing.assert_close(second.sigma_px, first.sigma_px, rtol=1e-7, atol=0)
-
-
 def test_information_of_points_is_that_of_the_normal_equations():
-    tried = CASES["hockey, outliers"]
+    tried = CASES["outliers"]
     run = Run(CalibrationLayer(tried.given.sticks).config)
     ended = adjust_cameras(begin(tried.given, run), run)
     objective, state = Objective(ended.kept, ended.last.losses), ended.last.minimum
