@@ -31,9 +31,9 @@ from torchstickcal.io.npz import read_npz, write_npz
 from torchstickcal.io.recording import Detection, Recording, View
 from torchstickcal.io.rig import Rig, RigCamera
 from torchstickcal.io.sessions import LoadedSession, load_session, read_recording, read_session
-from torchstickcal.io.skeletons import SKELETONS
-from torchstickcal.io.sports_stick_syn import SPORTS_STICK_SYN_JOINTS, read_sports_stick_syn
+from torchstickcal.io.sports_stick_syn import read_sports_stick_syn
 from torchstickcal.io.truth import Truth
+from torchstickcal.skeletons import SKELETONS, SPORTS_STICK_SYN_JOINTS
 
 __all__ = [
     "CALIBRATION_READERS",

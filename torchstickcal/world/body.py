@@ -1,0 +1,92 @@
+"""What the points of a body say of the vertical: head, feet, the centre of mass, left and right."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from torchstickcal.errors import CalibrationError
+from torchstickcal.skeletons import conventional
+
+_HEAD = ("head_top", "head", "nose", "left_ear", "right_ear", "left_eye", "right_eye")
+_FEET_M = {"ankle": 0.07, "heel": 0.03, "big_toe": 0.02, "small_toe": 0.02, "foot_index": 0.02}
+"""Points of a foot, and their heights above the floor when it stands flat, metres."""
+_HIPS = ("hip", "pelvis")
+_MASS = {"head": 0.08, "shoulder": 0.28, "hip": 0.36, "knee": 0.14, "ankle": 0.07, "elbow": 0.04, "wrist": 0.03}
+"""Shares of the mass of a body, put into its joints."""
+_ARMS = ("elbow", "wrist")
+_LEAST_SHARE = 0.5
+"""Share of the frames in which an arm must be known to count."""
+_ANKLE_TO_MIDDLE_M = 0.05
+"""How far the middle of a foot is in front of its ankle."""
+
+
+@dataclass(frozen=True, eq=False)
+class Body:
+    """An athlete in G frames, NaN where not known."""
+
+    head: Tensor
+    """(G, 3), metres"""
+    ankles: Tensor
+    """(G, 3), the middle between both"""
+    balance: Tensor
+    """(G, 3), from below the middle of the feet to the centre of mass"""
+    left: Tensor
+    """(G, 3), from right to left"""
+    feet: tuple[tuple[float, Tensor], ...]
+    """points of the feet (G, 3), each with its height above the floor when the foot stands flat"""
+
+    @staticmethod
+    def of(points: Tensor, names: Sequence[str] | None) -> Body:
+        """The body among points (G, P, 3), by their names in any spelling.
+
+        Raises:
+            CalibrationError: if head or ankles are not among them, or are never known together.
+        """
+        track = dict(zip(map(conventional, names or ()), points.double().unbind(1), strict=False))
+
+        def middle(*joints: str) -> Tensor | None:
+            """The middle of left and right of the first of some joints that is there, or the joint itself."""
+            for joint in joints:
+                if f"left_{joint}" in track and f"right_{joint}" in track:
+                    return (track[f"left_{joint}"] + track[f"right_{joint}"]) / 2
+                if joint in track:
+                    return track[joint]
+            return None
+
+        head = next((track[name] for name in _HEAD if name in track and bool(track[name].isfinite().any())), None)
+        ankles = middle("ankle")
+        if head is None or ankles is None or not bool((head - ankles).isfinite().any()):
+            raise CalibrationError(
+                "no standing body",
+                where="world",
+                got="no head" if head is None else "no ankles" if ankles is None else "no frame with head and ankles",
+                expected="points called head_top, head or nose, and left_ankle and right_ankle, known in the same frames",
+            )
+        left = _known_mean([track[f"left_{joint}"] - track[f"right_{joint}"] for joint in ("hip", "shoulder") if
+                            {f"left_{joint}", f"right_{joint}"} <= set(track)] or
+                           [track["left_ankle"] - track["right_ankle"]])  # fmt: skip
+        joints = {name: middle(*_HIPS) if name == "hip" else head if name == "head" else middle(name) for name in _MASS}
+        needed = {name: joint for name, joint in joints.items() if joint is not None}
+        for arm in _ARMS:
+            if arm in needed and float(needed[arm].isfinite().all(-1).double().mean()) < _LEAST_SHARE:
+                del needed[arm]
+        mass = sum(_MASS[name] * joint for name, joint in needed.items()) / sum(map(_MASS.__getitem__, needed))
+        whole = {"head", "shoulder", "hip", "ankle"} <= set(needed)
+        forward = torch.linalg.cross(left, head - ankles)
+        support = ankles + _ANKLE_TO_MIDDLE_M * forward / forward.norm(dim=-1, keepdim=True)
+        feet = tuple(
+            (height_m, track[f"{side}_{point}"])
+            for point, height_m in _FEET_M.items()
+            for side in ("left", "right")
+            if f"{side}_{point}" in track and bool(track[f"{side}_{point}"].isfinite().any())
+        )
+        return Body(head, ankles, mass - support if whole else head - support, left, feet)
+
+
+def _known_mean(vectors: list[Tensor]) -> Tensor:
+    """The mean of vectors (G, 3), of those that are known in each frame."""
+    return torch.stack(vectors).nanmean(0)
