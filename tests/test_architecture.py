@@ -28,7 +28,7 @@ FLOORS = [
     ["solvers"],
     ["metrics"],
     ["world"],
-    ["result"],
+    ["result", "reconstruction"],
     ["io"],
     ["pipeline.run", "pipeline.scale"],
     ["pipeline.stage"],

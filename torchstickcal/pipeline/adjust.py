@@ -210,6 +210,7 @@ def begin(
     refined: Sequence[str] = (),
     offsets_frames: Tensor | None = None,
     start: WarmStart | None = None,
+    poses: tuple[Tensor, Tensor] | None = None,
 ) -> Adjustment:
     """One session with the first estimate of its rig and points.
 
@@ -219,6 +220,8 @@ def begin(
         refined: what is to be estimated of the cameras beside their poses.
         offsets_frames: (C,), time offsets of the cameras' frames, in frames; None for those given.
         start: an earlier estimate; None to estimate the rig from nothing.
+        poses: rotations (C, 3, 3) and translations (C, 3) to start from, up to scale, with the first camera as the world; None to
+            estimate them from nothing.
 
     Raises:
         ConfigError: if nothing sets the scale, and if there are camera groups, but not a label for each camera.
@@ -231,6 +234,10 @@ def begin(
     check_scale(seen, rulers(seen, config))
     if start is not None:
         state = _state_of(start, seen, config)
+    elif poses is not None:
+        rotations, translations = poses[0][None].double(), poses[1][None].double()
+        state = State.of(rotations, translations, triangulated(seen, rotations, translations, config.initialise))
+        refined = refined if observations.intrinsics_known or "focal" in refined else with_refinements(refined, ("focal_shared",))
     elif observations.intrinsics_known:
         state = initialise(seen, config.initialise, observations.camera_labels)
     else:
@@ -243,7 +250,7 @@ def begin(
     if seen.unknowns.clocked:
         begun = replace(begun, measurements=begun.exposures.unmoved(seen))
     if start is not None and config.relabel:
-        begun = _relabelled(begun, run)
+        begun = relabelled(begun, run)
     if start is not None and seen.unknowns.clocked:
         known = begun.measurements.keeping(start.inliers.flatten(1)[None])
         support = Support.of(known, begun.state, start.sigma_px[None].double())
@@ -262,9 +269,9 @@ def adjust_cameras(adjustment: Adjustment, run: Run, only_last: bool = False) ->
     """
     stages = list(run.camera_stages.items())
     if only_last:
-        return _synchronised(_through(stages[-1:], adjustment, run), run)
+        return _synchronised(through(stages[-1:], adjustment, run), run)
     first = _relabelling(stages[:1], adjustment, run)
-    return _synchronised(_through(stages[1:], first, run), run)
+    return _synchronised(through(stages[1:], first, run), run)
 
 
 def adjust_again(adjustment: Adjustment, run: Run, refined: Sequence[str]) -> Adjustment:
@@ -290,12 +297,12 @@ def adjust_again(adjustment: Adjustment, run: Run, refined: Sequence[str]) -> Ad
         result = again.last._replace(state=state, minimum=replace(again.last.minimum, unknowns=values))
         return _synchronised(replace(again, results=(result,)), run)
     begun = replace(again, results=(), records=((),) * seen.sessions)
-    return _synchronised(_through(run.camera_stages.items(), begun, run), run)
+    return _synchronised(through(run.camera_stages.items(), begun, run), run)
 
 
 def adjust_points(adjustment: Adjustment, run: Run) -> Adjustment:
     """The stages in which the cameras are fixed."""
-    return _through(run.point_stages.items(), adjustment, run)
+    return through(run.point_stages.items(), adjustment, run)
 
 
 def measured(frames: CommonFrames, config: Config) -> Measurements:
@@ -314,7 +321,7 @@ def points_used(observations: Observations, config: Config) -> list[int] | None:
     return None
 
 
-def _through(stages: Iterable[tuple[str, Stage]], adjustment: Adjustment, run: Run) -> Adjustment:
+def through(stages: Iterable[tuple[str, Stage]], adjustment: Adjustment, run: Run) -> Adjustment:
     """After some stages. One in which keypoints count as fewer is repeated, until what they count no longer changes.
 
     Errors that last are hidden in the cameras, as long as points with such errors determine them.
@@ -334,20 +341,20 @@ def _through(stages: Iterable[tuple[str, Stage]], adjustment: Adjustment, run: R
 
 def _relabelling(stages: Sequence[tuple[str, Stage]], begun: Adjustment, run: Run) -> Adjustment:
     """Sessions after their first stages, which are run again where label errors were found, until none are left."""
-    ended = _through(stages, begun, run)
+    ended = through(stages, begun, run)
     for _ in range(_MAX_RELABELLINGS if run.config.relabel else 0):
         before = [ended[session] for session in range(ended.seen.sessions)]
-        after = [_relabelled(session, run) for session in before]
+        after = [relabelled(session, run) for session in before]
         changed = torch.tensor(
             [new is not old for new, old in zip(after, before, strict=True)], device=ended.state.points.device
         )
         if not changed.any():
             break
-        ended = _through(stages, Adjustment.stack(after), run).replaced(~changed, ended)
+        ended = through(stages, Adjustment.stack(after), run).replaced(~changed, ended)
     return ended
 
 
-def _relabelled(adjustment: Adjustment, run: Run) -> Adjustment:
+def relabelled(adjustment: Adjustment, run: Run) -> Adjustment:
     """One session with its label errors undone; the same object where there are none."""
     began = time.perf_counter()
     frames, given = adjustment.frames[0], adjustment.measurements

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import time
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
-from typing import Any, Literal, Protocol
+from typing import TYPE_CHECKING, Any, Literal, Protocol
 
 from torchstickcal.config import Config, Refine, load_config, with_refine
 from torchstickcal.losses import LOSSES
@@ -16,9 +17,13 @@ from torchstickcal.pipeline.check import CameraCheck
 from torchstickcal.pipeline.conclude import conclude
 from torchstickcal.pipeline.run import Run
 from torchstickcal.pipeline.selection import ModelSelection
+from torchstickcal.pipeline.start import CONTRADICTED_START, Poses, starting_from
 from torchstickcal.result import Calibration
 from torchstickcal.solvers import IterationRecord, ignore_record
 from torchstickcal.workers import on_worker
+
+if TYPE_CHECKING:
+    from torchstickcal.io.rig import Rig
 
 _ = len(LOSSES), len(REFINEMENTS)  # imported now: a process that is forked while another thread imports them lacks some
 
@@ -40,6 +45,7 @@ def calibrate(
     config: str | Path | Mapping[str, Any] | Config = "default",
     callback: Callback | None = None,
     refine: Sequence[Refine] | Literal["auto"] | None = None,
+    initial: Calibration | Rig | None = None,
 ) -> Calibration:
     """Find the extrinsics of all cameras and the 3D points, in metres, in the frame of the first camera.
 
@@ -50,6 +56,9 @@ def calibrate(
         refine: what else to estimate of the cameras, instead of what the configuration says: names of
             :data:`torchstickcal.model.unknowns.REFINEMENTS`, such as ``focal``, ``radial`` or ``time_offset``, or ``auto`` for
             what the keypoints contradict.
+        initial: poses of all cameras to start from, of an earlier calibration or of another program, in any frame and up to
+            scale. Cameras are matched by name, else by the last number in the names, else by order. Where no intrinsics are
+            known, its own are the start. Where the keypoints contradict the poses, they are not used, and a warning says so.
 
     Returns:
         The calibration. Its ``status`` says whether every stage converged; a stage that did not leaves the best state it found.
@@ -58,6 +67,7 @@ def calibrate(
         ConfigError: if the configuration cannot be used.
         ObservationError: if clocks are to be estimated without a frame rate.
         RigError: if the cameras cannot be placed in one rig.
+        CalibrationError: if ``initial`` lacks a camera or has no poses.
 
     Example:
         >>> from torchstickcal.simulate import golf_session
@@ -71,13 +81,16 @@ def calibrate(
     settings = load_config(config)
     if refine is not None:
         settings = with_refine(settings, refine)
-    return on_worker(observations.keypoints.device, _calibrated, observations, settings, callback)
+    start = None
+    if initial is not None:
+        observations, start = starting_from(initial, observations)
+    return on_worker(observations.keypoints.device, _calibrated, observations, settings, callback, start)
 
 
-def _calibrated(observations: Observations, config: Config, callback: Callback | None) -> Calibration:
+def _calibrated(observations: Observations, config: Config, callback: Callback | None, start: Poses | None) -> Calibration:
     began = time.perf_counter()
     run = Run(config, callback.on_iteration if callback else ignore_record)
-    models = ModelSelection(observations, run)
+    models = ModelSelection(observations, run, start)
 
     # 1. Synchronise: where the cameras' frames clearly do not belong together, find the time offsets.
     clocks = models.searched() if "time_offset" in models.allowed and models.unsynchronised else None
@@ -97,6 +110,8 @@ def _calibrated(observations: Observations, config: Config, callback: Callback |
     unsynchronised = config.synchronise and "time_offset" not in ended.refined and models.unsynchronised
     run.took("total", time.perf_counter() - began)
     calibration = conclude(ended, check, clocks, unsynchronised, run.seconds)
+    if models.start_contradicted:
+        calibration = replace(calibration, warnings=(*calibration.warnings, CONTRADICTED_START))
     if callback:
         callback.on_end(calibration)
     return calibration

@@ -29,13 +29,16 @@ class ModelSelection:
     Args:
         observations: the session.
         run: what all steps share.
+        start: poses to start from, as of :func:`torchstickcal.pipeline.adjust.begin`.
 
     Raises:
         ObservationError: if the configuration names something to refine that the session does not allow.
     """
 
-    def __init__(self, observations: Observations, run: Run) -> None:
-        self._observations, self._run = observations, run
+    def __init__(self, observations: Observations, run: Run, start: tuple[Tensor, Tensor] | None = None) -> None:
+        self._observations, self._run, self._start = observations, run, start
+        self.start_contradicted = False
+        """whether the poses to start from were given up, because others fit the keypoints and they do not"""
         config = run.config
         self.named = () if config.refine == "auto" else tuple(config.refine)
         """what the configuration refines"""
@@ -73,6 +76,18 @@ class ModelSelection:
         Raises:
             RigError: if the cameras cannot be placed in one rig.
         """
+        found, clocks = self._found(clocks)
+        if self._start is not None and not any(map(_fits, found)):
+            given, self._start = (self._start, found), None
+            found, clocks = self._found(clocks)
+            self.start_contradicted = any(map(_fits, found))
+            if not self.start_contradicted:
+                self._start, found = given
+        best = min(found, key=_median_squared_residual)
+        return best if set(self.named) <= set(best.refined) else self._with(best, self.named), clocks
+
+    def _found(self, clocks: ClockEstimate | None) -> tuple[list[Adjustment], ClockEstimate | None]:
+        """What was adjusted at all time offsets that were tried; arguments and errors as of :meth:`adjusted`."""
         found = [] if clocks is None else self._at_offsets(clocks)
         failure: RigError | None = None
         if not any(map(_fits, found)):
@@ -85,8 +100,7 @@ class ModelSelection:
             found += self._at_offsets(clocks)
         if not found and failure is not None:
             raise failure
-        best = min(found, key=_median_squared_residual)
-        return best if set(self.named) <= set(best.refined) else self._with(best, self.named), clocks
+        return found, clocks
 
     def refined_where_contradicted(self, adjusted: Adjustment, check: CameraCheck) -> tuple[Adjustment, CameraCheck]:
         """Adjusted with what the keypoints contradict of the cameras, the most contradicted first, and checked again."""
@@ -111,7 +125,7 @@ class ModelSelection:
 
     def _adjusted_at(self, refined: Sequence[str], offsets_frames: Tensor | None = None) -> Adjustment:
         """Initialised and adjusted at some time offsets (C,) of the cameras, in frames; None for those given."""
-        begun = begin(self._observations, self._run, refined, offsets_frames)
+        begun = begin(self._observations, self._run, refined, offsets_frames, poses=self._start)
         return self._at_nearest_frames(adjust_cameras(begun, self._run))
 
     def _with(self, adjustment: Adjustment, refined: Sequence[str]) -> Adjustment:
@@ -125,7 +139,8 @@ class ModelSelection:
             if not bool((remaining.abs() > _FAR_FRAMES).any()):
                 break
             offsets = adjustment.frames[0].offsets_frames + remaining
-            adjustment = adjust_cameras(begin(self._observations, self._run, adjustment.refined, offsets), self._run)
+            begun = begin(self._observations, self._run, adjustment.refined, offsets, poses=self._start)
+            adjustment = adjust_cameras(begun, self._run)
         return adjustment
 
     @property

@@ -38,7 +38,7 @@ def warnings_of(
         clocks: what a search for time offsets has found; None without one.
         unsynchronised: whether the motion contradicts the clocks, which were not estimated.
     """
-    found = [*ended.observations[0].warnings, *_labels(ended), *_keypoints(ended), *_same_views(ended)]
+    found = [*keypoint_warnings(ended), *_same_views(ended)]
     if len(ended.measurements.sticks) > 1:
         found += _contradicted_lengths(ended)
     for name, unknown in all_unknowns().items():
@@ -53,6 +53,11 @@ def warnings_of(
         if reason:
             found.append(f"{ended.observations[0].camera_label(camera)}: its time offset is uncertain, {reason}.")
     return tuple(found)
+
+
+def keypoint_warnings(ended: Adjustment) -> tuple[str, ...]:
+    """Warnings about the keypoints alone."""
+    return (*ended.observations[0].warnings, *_labels(ended), *_keypoints(ended))
 
 
 def _labels(ended: Adjustment) -> list[str]:
