@@ -12,7 +12,7 @@ import torchstickcal
 
 ROOT = Path(__file__).parents[1]
 FLOORS = [
-    ["errors", "workers", "lazy", "precision"],
+    ["errors", "workers", "lazy", "precision", "samples"],
     ["files", "shapes", "arrays"],
     ["untrusted"],
     ["registry", "skeletons"],

@@ -40,7 +40,7 @@ class Given:
 
     Args:
         stick: one stick or several; the ends are names or indices of points. ``RKnee`` and ``knee_right`` also mean the point
-            ``right_knee``.
+            ``right_knee``. An empty list where none is needed, as for :func:`torchstickcal.triangulate`.
         intrinsics: a calibration, or a file of one, of which the intrinsics are used. Cameras are matched by name, else by the
             last number in the names, else by order.
         image_size: width and height of the images in which the keypoints were detected, (2,) or (C, 2), pixels.
@@ -154,7 +154,7 @@ def amended(observations: Observations, given: Given) -> tuple[Observations, tup
         )
         changes |= {name: getattr(lenses, name) for name in ("intrinsics", "distortion", "fisheye", "image_size")}
         changes["intrinsics_known"] = True
-    if given.stick is not None:
+    if given.stick:
         changes["sticks"] = _sticks(given.stick, changes.get("point_names", observations.point_names) or ())
     return (replace(observations, **changes) if changes else observations), notes
 

@@ -92,7 +92,7 @@ def arranged(
 
     Arguments and errors as of :func:`lenses_of`; without labels the cameras must be as many, and are in the same order.
     """
-    order, notes = (list(range(len(rig.names))), list[str]()) if labels is None else _matched(rig.names, labels)
+    order, notes = matched(rig.names, labels)
     names = [rig.names[index] for index in order] if labels is None else list(labels)
     if image_size is not None and len(image_size) != len(order):
         raise CalibrationError(
@@ -175,8 +175,14 @@ def _turned(
     return turned, lens, new_size
 
 
-def _matched(names: Sequence[str], labels: Sequence[str]) -> tuple[list[int], list[str]]:
-    """The index among a calibration's cameras of each of a recording's."""
+def matched(names: Sequence[str], labels: Sequence[str] | None) -> tuple[list[int], list[str]]:
+    """The index among a calibration's cameras of each of a recording's, and a sentence if they are not matched by name.
+
+    Raises:
+        FileFormatError: if there is no match.
+    """
+    if labels is None:
+        return list(range(len(names))), []
     if set(labels) <= set(names) and len(set(names)) == len(names):
         return [names.index(label) for label in labels], []
     numbers, wanted = list(map(last_number, names)), list(map(last_number, labels))

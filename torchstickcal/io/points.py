@@ -21,7 +21,7 @@ _UNKNOWN_RESIDUAL = -1.0
 """What C3D writes for a point that is not known."""
 
 
-@point_writer("trc", "points as OpenSim reads them, y up, in millimetres (.trc)", file_name="points.trc")
+@point_writer("trc", "points as OpenSim reads them, y up, in millimetres (.trc)", file_name="points.trc", needs_rate=True)
 def write_trc(path: Path, motion: Motion) -> None:
     """Write the points with y up. Cells are empty where a point is not known. Time begins at 0."""
     motion = motion.evenly("TRC").with_y_up()
@@ -43,7 +43,7 @@ def write_trc(path: Path, motion: Motion) -> None:
         temporary.write_text("".join("\t".join(line) + "\n" for line in lines), "utf-8")
 
 
-@point_writer("c3d", "points as C3D, in millimetres; needs ezc3d (.c3d)", file_name="points.c3d")
+@point_writer("c3d", "points as C3D, in millimetres; needs ezc3d (.c3d)", file_name="points.c3d", needs_rate=True)
 def write_c3d(path: Path, motion: Motion) -> None:
     """Write the points in the axes of the calibration, with their standard deviations as residuals."""
     try:

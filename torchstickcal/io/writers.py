@@ -6,6 +6,7 @@ command line then know it.
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -34,6 +35,7 @@ class Writer:
             or its points as a :class:`~torchstickcal.io.Motion`.
         files: the files in the folder that it writes; empty for a format of one file. They are called so, or in some folder
             below.
+        needs_rate: whether points can only be written with a frame rate.
     """
 
     function: Callable[[Path, Any], None]
@@ -41,6 +43,7 @@ class Writer:
     description: str
     writes: Literal["calibration", "cameras", "points"] = "calibration"
     files: tuple[str, ...] = ()
+    needs_rate: bool = False
 
     def write(self, path: str | Path, content: Calibration | Rig | Motion) -> None:
         """Write a calibration, or what of it the format holds.
@@ -132,12 +135,14 @@ def camera_writer(
     return _registering(name, Writer(_nothing, file_name, description, "cameras", tuple(files)), replace)
 
 
-def point_writer(name: str, description: str, *, file_name: str, replace: bool = False) -> Callable[[_Function], _Function]:
+def point_writer(
+    name: str, description: str, *, file_name: str, needs_rate: bool = False, replace: bool = False
+) -> Callable[[_Function], _Function]:
     """A decorator as :func:`calibration_writer`, for a function that is called with a path and a :class:`Motion`.
 
-    So the format can also be written by ``torchstickcal triangulate``.
+    So the format can also be written by ``torchstickcal triangulate``. ``needs_rate`` says whether it needs a frame rate.
     """
-    return _registering(name, Writer(_nothing, file_name, description, "points"), replace)
+    return _registering(name, Writer(_nothing, file_name, description, "points", needs_rate=needs_rate), replace)
 
 
 def write_calibration(path: str | Path, calibration: Calibration | Rig | Motion, format: str) -> None:
@@ -198,8 +203,7 @@ def _nothing(path: Path, content: object) -> None:
 
 def _registering(name: str, writer: Writer, replace: bool) -> Callable[[_Function], _Function]:
     def register(function: _Function) -> _Function:
-        own = Writer(function, writer.file_name, writer.description, writer.writes, writer.files)
-        CALIBRATION_WRITERS.register(name, own, replace=replace)
+        CALIBRATION_WRITERS.register(name, dataclasses.replace(writer, function=function), replace=replace)
         return function
 
     return register

@@ -47,7 +47,10 @@ _STARTS = 3
 
 
 def triangulate(
-    observations: Observations, calibration: Calibration | Rig, config: str | Path | Mapping[str, Any] | Config = "default"
+    observations: Observations,
+    calibration: Calibration | Rig,
+    config: str | Path | Mapping[str, Any] | Config = "default",
+    turned: str | None = None,
 ) -> Reconstruction:
     """Find the points of a recording, in metres, with cameras that were calibrated before and have not been moved since.
 
@@ -60,6 +63,7 @@ def triangulate(
         calibration: the cameras: matched by name, else by the last number in the names, else by order; without names by order.
         config: as of :func:`torchstickcal.calibrate`. ``points``, ``precision``, ``relabel``, ``synchronise`` and the last
             stage with ``cameras = "held"`` count.
+        turned: how images were turned after the calibration: ``left``, ``right`` (a quarter, as a viewer sees it) or ``back``.
 
     Raises:
         CalibrationError: if a camera is missing, or the calibration has no poses in a known unit.
@@ -75,15 +79,15 @@ def triangulate(
         >>> reconstruction.points.shape, reconstruction.world.name
         (torch.Size([20, 21, 3]), 'athlete')
     """
-    from torchstickcal.io.lenses import arranged, lenses_of
+    from torchstickcal.io.lenses import arranged, lenses_of, matched
     from torchstickcal.io.rig import Rig
 
     rig = calibration if isinstance(calibration, Rig) else Rig.of_calibration(calibration)
     size, count = observations.image_size, observations.num_cameras
     images = None if size is None else size.double().cpu().expand(count, 2)
-    rig, notes = arranged(rig, observations.camera_names, images)
+    covariance = _covariance(calibration, matched(rig.names, observations.camera_names)[0])
+    rig, notes = arranged(rig, observations.camera_names, images, turned)
     lenses, _ = lenses_of(rig, rig.names, None)
-    covariance = _covariance(calibration, rig, observations.camera_names)
     given = replace(
         observations,
         intrinsics=lenses.intrinsics,
@@ -100,23 +104,15 @@ def triangulate(
     return replace(found, world=world or found.world, warnings=(*notes, *found.warnings), sticks=observations.sticks)
 
 
-def _covariance(calibration: Calibration | Rig, rig: Rig, labels: tuple[str, ...] | None) -> Tensor:
-    """Covariance of the cameras' tangents in the order of the rig; zero where the calibration does not say it."""
-    size = 6 * (len(rig.names) - 1)
+def _covariance(calibration: Calibration | Rig, order: list[int]) -> Tensor:
+    """Covariance of the tangents of cameras in an order, relative to the first of them; zero where nothing is known of it."""
     if not isinstance(calibration, Calibration):
+        size = 6 * (len(order) - 1)
         return torch.zeros(size, size, dtype=torch.float64)
-    whole = torch.nn.functional.pad(calibration.covariance.cpu(), (6, 0, 6, 0)).unflatten(0, (-1, 6)).unflatten(2, (-1, 6))
-    order = [_index(pose, calibration) for pose in zip(*rig.poses(), strict=True)]
-    whole = whole[order][:, :, order]
-    first = whole[:1, :, :1]
-    relative = whole - whole[:1] - whole[:, :, :1] + first  # uncertain relative to the first of them
+    blocks = torch.nn.functional.pad(calibration.covariance.cpu(), (6, 0, 6, 0)).unflatten(0, (-1, 6)).unflatten(2, (-1, 6))
+    blocks = blocks[order][:, :, order]
+    relative = blocks - blocks[:1] - blocks[:, :, :1] + blocks[:1, :, :1]
     return relative[1:, :, 1:].flatten(2, 3).flatten(0, 1)
-
-
-def _index(pose: tuple[Tensor, Tensor], calibration: Calibration) -> int:
-    """Which camera of a calibration has a pose."""
-    differences = (calibration.translations.double().cpu() - pose[1]).norm(dim=1)
-    return int(differences.argmin())
 
 
 def _readout(calibration: Calibration | Rig, observations: Observations, image_size: Tensor | None) -> float | None:

@@ -48,7 +48,8 @@ def athlete_frame(points: Tensor, point_names: Sequence[str] | None, rotations: 
     known = (facing + body.ankles).isfinite().all(-1).nonzero().flatten()
     first = int(known[0]) if len(known) else int(body.ankles.isfinite().all(-1).nonzero()[0])
     forward = facing[first] if len(known) else rotations[0, 2].double().cpu()
-    below = body.ankles[first] + (found.floor - body.ankles[first] @ found.up) * found.up
+    feet = body.ankles[first] * body.height_m
+    below = feet + (found.floor - feet @ found.up) * found.up
     return upright_frame(found.up, forward, below, World(
         "athlete",
         "the point of the floor below the feet of the athlete in the first frame",

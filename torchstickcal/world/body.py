@@ -12,24 +12,28 @@ from torchstickcal.errors import CalibrationError
 from torchstickcal.skeletons import conventional
 
 _HEAD = ("head_top", "head", "nose", "left_ear", "right_ear", "left_eye", "right_eye")
-_FEET_M = {"ankle": 0.07, "heel": 0.03, "big_toe": 0.02, "small_toe": 0.02, "foot_index": 0.02}
-"""Points of a foot, and their heights above the floor when it stands flat, metres."""
+_FEET = {"ankle": 0.044, "heel": 0.019, "big_toe": 0.013, "small_toe": 0.013, "foot_index": 0.013}
+"""Points of a foot, and their heights above the floor when it stands flat, as shares of the height of the head above the ankles."""
 _HIPS = ("hip", "pelvis")
 _MASS = {"head": 0.08, "shoulder": 0.28, "hip": 0.36, "knee": 0.14, "ankle": 0.07, "elbow": 0.04, "wrist": 0.03}
 """Shares of the mass of a body, put into its joints."""
 _ARMS = ("elbow", "wrist")
 _LEAST_SHARE = 0.5
 """Share of the frames in which an arm must be known to count."""
-_ANKLE_TO_MIDDLE_M = 0.05
-"""How far the middle of a foot is in front of its ankle."""
+_ANKLE_TO_MIDDLE = 0.03
+"""How far the middle of a foot is in front of its ankle, as a share of the same height."""
+_UPRIGHT = 0.9
+"""Quantile of the distances of the head from the ankles that is that height."""
 
 
 @dataclass(frozen=True, eq=False)
 class Body:
     """An athlete in G frames, NaN where not known."""
 
+    height_m: float
+    """of the head above the ankles where the body is upright, metres"""
     head: Tensor
-    """(G, 3), metres"""
+    """(G, 3), in these heights, as all lengths below"""
     ankles: Tensor
     """(G, 3), the middle between both"""
     balance: Tensor
@@ -46,7 +50,8 @@ class Body:
         Raises:
             CalibrationError: if head or ankles are not among them, or are never known together.
         """
-        track = dict(zip(map(conventional, names or ()), points.double().unbind(1), strict=False))
+        tracks = zip(map(conventional, names or ()), points.double().unbind(1), strict=False)
+        track = {name: positions for name, positions in tracks if bool(positions.isfinite().any())}
 
         def middle(*joints: str) -> Tensor | None:
             """The middle of left and right of the first of some joints that is there, or the joint itself."""
@@ -57,7 +62,7 @@ class Body:
                     return track[joint]
             return None
 
-        head = next((track[name] for name in _HEAD if name in track and bool(track[name].isfinite().any())), None)
+        head = next((track[name] for name in _HEAD if name in track), None)
         ankles = middle("ankle")
         if head is None or ankles is None or not bool((head - ankles).isfinite().any()):
             raise CalibrationError(
@@ -66,9 +71,11 @@ class Body:
                 got="no head" if head is None else "no ankles" if ankles is None else "no frame with head and ankles",
                 expected="points called head_top, head or nose, and left_ankle and right_ankle, known in the same frames",
             )
-        left = _known_mean([track[f"left_{joint}"] - track[f"right_{joint}"] for joint in ("hip", "shoulder") if
-                            {f"left_{joint}", f"right_{joint}"} <= set(track)] or
-                           [track["left_ankle"] - track["right_ankle"]])  # fmt: skip
+        known = (head - ankles).norm(dim=-1)
+        height_m = float(known[known.isfinite()].quantile(_UPRIGHT))
+        track, head, ankles = {name: positions / height_m for name, positions in track.items()}, head / height_m, ankles / height_m
+        trunk = [joint for joint in ("hip", "shoulder") if {f"left_{joint}", f"right_{joint}"} <= set(track)]
+        left = _known_mean([track[f"left_{joint}"] - track[f"right_{joint}"] for joint in trunk or ["ankle"]])
         joints = {name: middle(*_HIPS) if name == "hip" else head if name == "head" else middle(name) for name in _MASS}
         needed = {name: joint for name, joint in joints.items() if joint is not None}
         for arm in _ARMS:
@@ -77,14 +84,14 @@ class Body:
         mass = sum(_MASS[name] * joint for name, joint in needed.items()) / sum(map(_MASS.__getitem__, needed))
         whole = {"head", "shoulder", "hip", "ankle"} <= set(needed)
         forward = torch.linalg.cross(left, head - ankles)
-        support = ankles + _ANKLE_TO_MIDDLE_M * forward / forward.norm(dim=-1, keepdim=True)
+        support = ankles + _ANKLE_TO_MIDDLE * forward / forward.norm(dim=-1, keepdim=True)
         feet = tuple(
-            (height_m, track[f"{side}_{point}"])
-            for point, height_m in _FEET_M.items()
+            (height, track[f"{side}_{point}"])
+            for point, height in _FEET.items()
             for side in ("left", "right")
-            if f"{side}_{point}" in track and bool(track[f"{side}_{point}"].isfinite().any())
+            if f"{side}_{point}" in track
         )
-        return Body(head, ankles, mass - support if whole else head - support, left, feet)
+        return Body(height_m, head, ankles, mass - support if whole else head - support, left, feet)
 
 
 def _known_mean(vectors: list[Tensor]) -> Tensor:

@@ -21,8 +21,8 @@ _CAMERA_DEG, _CAMERA_CASES = 1.0, 3
 """How far from upright cameras are before they are compared, and as many cameras as this counts for."""
 _STEEP = 0.8
 """Largest share of a camera's viewing direction along the vertical: one that looks down has no upright."""
-_FOOTHOLD_M, _CELL_M = 0.03, 0.2
-"""How far from the floor a standing foot is, and the size of a place on which it stands."""
+_FOOTHOLD, _CELL = 0.019, 0.125
+"""How far from the floor a standing foot is, and the size of a place on which it stands, in heights of the body."""
 _LEAST_STAY = 0.03
 """Share of the frames in which a foot is at one place, from which on it stands there."""
 _CUT = 3.0
@@ -31,8 +31,8 @@ _ROUNDS = 15
 _FURTHEST_FROM_BODY = math.cos(math.radians(45))
 _LOW = 0.15
 """Quantile of a foot's heights at which it stands."""
-_FLOOR_M = 0.01
-"""How well it is known how high a joint of a standing foot is."""
+_FLOOR = 0.007
+"""How well it is known how high a joint of a standing foot is, in heights of the body."""
 
 
 class Upright(NamedTuple):
@@ -65,14 +65,14 @@ def upright(body: Body, rotations: Tensor) -> Upright:
         std_deg = math.degrees(float(torch.linalg.inv(information).diagonal().sum().sqrt()))
     if float(up @ first) < _FURTHEST_FROM_BODY:
         up, std_deg = first, math.degrees(math.acos(_FURTHEST_FROM_BODY))
-    lows = [_low(track @ up) - height_m for height_m, track in body.feet]
-    floor = min(lows)
-    return Upright(up, std_deg, floor, math.hypot(_FLOOR_M, math.radians(std_deg) * _reach(body, up)))
+    floor = min(_low(track @ up) - height for height, track in body.feet)
+    floor_std = math.hypot(_FLOOR, math.radians(std_deg) * _reach(body, up))
+    return Upright(up, std_deg, floor * body.height_m, floor_std * body.height_m)
 
 
 def _balance(body: Body, up: Tensor, along: Tensor) -> tuple[Tensor, Tensor]:
     """Information (2, 2) and its product with the step (2,) that the balance of the body asks for."""
-    mean = _unit(body.balance[body.balance.isfinite().all(-1)].mean(0))
+    mean = _unit(_directions(body.balance[body.balance.isfinite().all(-1)]).mean(0))
     precision = 1 / math.radians(_BALANCE_DEG) ** 2
     return precision * torch.eye(2, dtype=torch.float64), precision * along @ (mean - up)
 
@@ -96,7 +96,7 @@ def _cameras(rotations: Tensor, up: Tensor, along: Tensor) -> tuple[Tensor, Tens
 
 def _footholds(body: Body, up: Tensor, along: Tensor) -> tuple[Tensor, Tensor]:
     """The same of the places where feet stand, which lie in one plane."""
-    places = [place for height_m, track in body.feet for place in _places(track - height_m * up, up, along)]
+    places = [place for height, track in body.feet for place in _places(track - height * up, up, along)]
     if len(places) < 2:
         return torch.zeros(2, 2, dtype=torch.float64), torch.zeros(2, dtype=torch.float64)
     points = torch.stack(places)
@@ -104,16 +104,16 @@ def _footholds(body: Body, up: Tensor, along: Tensor) -> tuple[Tensor, Tensor]:
     weights = torch.ones_like(heights)
     for _ in range(3):
         residuals = heights - (weights * heights).sum() / weights.sum()
-        weights = 1 / (1 + residuals.square() / (_CUT * _FOOTHOLD_M) ** 2).square()
+        weights = 1 / (1 + residuals.square() / (_CUT * _FOOTHOLD) ** 2).square()
     rows = flat - (weights[:, None] * flat).sum(0) / weights.sum()
-    precision = weights / _FOOTHOLD_M**2
+    precision = weights / _FOOTHOLD**2
     return rows.mT @ (precision[:, None] * rows), -rows.mT @ (precision * residuals)
 
 
 def _places(track: Tensor, up: Tensor, along: Tensor) -> list[Tensor]:
     """Points (3,) at which a foot (G, 3) stands: the lowest in each place in which it stays."""
     known = track[track.isfinite().all(-1)]
-    cells = (known @ along.mT / _CELL_M).floor().long()
+    cells = (known @ along.mT / _CELL).floor().long()
     found: list[Tensor] = []
     for cell in cells.unique(dim=0):
         inside = known[(cells == cell).all(1)]
@@ -129,7 +129,7 @@ def _low(heights: Tensor) -> float:
 
 
 def _reach(body: Body, up: Tensor) -> float:
-    """Root mean square of the distances of the ankles from their middle along the floor, metres."""
+    """Root mean square of the distances of the ankles from their middle along the floor."""
     flat = body.ankles[body.ankles.isfinite().all(-1)]
     flat = flat - (flat @ up)[:, None] * up
     return float((flat - flat.mean(0)).square().sum(-1).mean().sqrt())
