@@ -22,6 +22,10 @@ _LEAST_SHARE = 0.5
 """Share of the frames in which an arm must be known to count."""
 _ANKLE_TO_MIDDLE = 0.03
 """How far the middle of a foot is in front of its ankle, as a share of the same height."""
+_LIFTED, _LIFTED_SCALE = 0.12, 0.02
+"""Difference of height from which a foot carries less than the other, which no error of the vertical explains, in these heights."""
+_STEP, _MOVED = 3, 0.02
+"""Frames before and after in which a foot that carries moves less than so many of these heights."""
 _UPRIGHT = 0.9
 """Quantile of the distances of the head from the ankles that is that height."""
 
@@ -36,8 +40,10 @@ class Body:
     """(G, 3), in these heights, as all lengths below"""
     ankles: Tensor
     """(G, 3), the middle between both"""
-    balance: Tensor
-    """(G, 3), from below the middle of the feet to the centre of mass"""
+    both_ankles: Tensor
+    """(2, G, 3), left and right"""
+    mass: Tensor
+    """(G, 3), the centre of mass"""
     left: Tensor
     """(G, 3), from right to left"""
     feet: tuple[tuple[float, Tensor], ...]
@@ -83,15 +89,36 @@ class Body:
                 del needed[arm]
         mass = sum(_MASS[name] * joint for name, joint in needed.items()) / sum(map(_MASS.__getitem__, needed))
         whole = {"head", "shoulder", "hip", "ankle"} <= set(needed)
-        forward = torch.linalg.cross(left, head - ankles)
-        support = ankles + _ANKLE_TO_MIDDLE * forward / forward.norm(dim=-1, keepdim=True)
+        both = torch.stack([track.get(f"{side}_ankle", ankles) for side in ("left", "right")])
         feet = tuple(
             (height, track[f"{side}_{point}"])
             for point, height in _FEET.items()
             for side in ("left", "right")
             if f"{side}_{point}" in track
         )
-        return Body(height_m, head, ankles, mass - support if whole else head - support, left, feet)
+        return Body(height_m, head, ankles, both, mass if whole else head, left, feet)
+
+    def balance(self, up: Tensor) -> Tensor:
+        """From the ground below the feet to the centre of mass (G, 3); a foot that is lifted carries less.
+
+        Args:
+            up: (3,), the vertical as far as it is known.
+        """
+        heights = self.both_ankles @ up
+        lifted = heights - heights.amin(0)
+        moved = torch.stack([moved_around(ankle) for ankle in self.both_ankles]).nan_to_num()
+        carried = torch.sigmoid((_LIFTED - lifted) / _LIFTED_SCALE) / (moved.square() + _MOVED**2)
+        carried = carried / carried.sum(0)
+        forward = torch.linalg.cross(self.left, up.expand_as(self.left))
+        toes = _ANKLE_TO_MIDDLE * forward / forward.norm(dim=-1, keepdim=True)
+        return self.mass - (carried[..., None] * self.both_ankles).sum(0) - toes
+
+
+def moved_around(track: Tensor) -> Tensor:
+    """How far a point (G, 3) moves within a few frames around each one, (G,); NaN where that is not known."""
+    moved = torch.full_like(track[:, 0], torch.nan)
+    moved[_STEP:-_STEP] = (track[2 * _STEP :] - track[: -2 * _STEP]).norm(dim=-1)
+    return moved
 
 
 def _known_mean(vectors: list[Tensor]) -> Tensor:

@@ -13,11 +13,11 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from torchstickcal.world.body import Body
+from torchstickcal.world.body import Body, moved_around
 
 _BALANCE_DEG = 2.5
 """How far from the vertical a body's mean line of balance is."""
-_CAMERA_DEG, _CAMERA_CASES = 1.0, 3
+_CAMERA_DEG, _CAMERA_CASES = 1.3, 3
 """How far from upright cameras are before they are compared, and as many cameras as this counts for."""
 _STEEP = 0.8
 """Largest share of a camera's viewing direction along the vertical: one that looks down has no upright."""
@@ -25,6 +25,8 @@ _FOOTHOLD, _CELL = 0.019, 0.125
 """How far from the floor a standing foot is, and the size of a place on which it stands, in heights of the body."""
 _LEAST_STAY = 0.03
 """Share of the frames in which a foot is at one place, from which on it stands there."""
+_STILL = 0.01
+"""How far a standing foot moves within a few frames, in heights of the body."""
 _CUT = 3.0
 """Scale of the robust kernel, in standard deviations."""
 _ROUNDS = 15
@@ -72,7 +74,8 @@ def upright(body: Body, rotations: Tensor) -> Upright:
 
 def _balance(body: Body, up: Tensor, along: Tensor) -> tuple[Tensor, Tensor]:
     """Information (2, 2) and its product with the step (2,) that the balance of the body asks for."""
-    mean = _unit(_directions(body.balance[body.balance.isfinite().all(-1)]).mean(0))
+    balance = body.balance(up)
+    mean = _unit(_directions(balance[balance.isfinite().all(-1)]).mean(0))
     precision = 1 / math.radians(_BALANCE_DEG) ** 2
     return precision * torch.eye(2, dtype=torch.float64), precision * along @ (mean - up)
 
@@ -112,12 +115,13 @@ def _footholds(body: Body, up: Tensor, along: Tensor) -> tuple[Tensor, Tensor]:
 
 def _places(track: Tensor, up: Tensor, along: Tensor) -> list[Tensor]:
     """Points (3,) at which a foot (G, 3) stands: the lowest in each place in which it stays."""
-    known = track[track.isfinite().all(-1)]
+    total = int(track.isfinite().all(-1).sum())
+    known = track[moved_around(track) < _STILL]
     cells = (known @ along.mT / _CELL).floor().long()
     found: list[Tensor] = []
     for cell in cells.unique(dim=0):
         inside = known[(cells == cell).all(1)]
-        if len(inside) >= max(2, _LEAST_STAY * len(known)):
+        if len(inside) >= max(2, _LEAST_STAY * total):
             low = _low(inside @ up)
             found.append(inside.mean(0) + (low - inside.mean(0) @ up) * up)
     return found
