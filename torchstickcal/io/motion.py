@@ -99,6 +99,12 @@ class Motion:
         std_m = None if self.std_m is None else spread(self.std_m)
         return replace(self, points=spread(self.points), times=times, std_m=std_m)
 
+    def known(self) -> Motion:
+        """The points that are known in some frame."""
+        kept = np.isfinite(self.points).all(-1).any(0)
+        names = tuple(name for name, keep in zip(self.names, kept, strict=True) if keep)
+        return replace(self, points=self.points[:, kept], names=names, std_m=None if self.std_m is None else self.std_m[:, kept])
+
     def with_y_up(self) -> Motion:
         """The same with y up: z of the frame becomes y; in the frame of a camera, y and z are turned round.
 

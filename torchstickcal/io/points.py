@@ -23,8 +23,11 @@ _UNKNOWN_RESIDUAL = -1.0
 
 @point_writer("trc", "points as OpenSim reads them, y up, in millimetres (.trc)", file_name="points.trc", needs_rate=True)
 def write_trc(path: Path, motion: Motion) -> None:
-    """Write the points with y up. Cells are empty where a point is not known. Time begins at 0."""
-    motion = motion.evenly("TRC").with_y_up()
+    """Write the points with y up. Cells are empty where a point is not known; a point that never is has no columns.
+
+    Time begins at 0.
+    """
+    motion = motion.evenly("TRC").with_y_up().known()
     names = [_word(name) for name in motion.names]
     frames, points = motion.points.shape[:2]
     rate = f"{motion.rate_hz:.10g}"
