@@ -21,6 +21,10 @@ _FAR_FRAMES = 0.75
 """Remaining time offset, in frames, from which on a camera's frames are chosen anew."""
 _FITTING_SHARE, _FITTING_FOCAL_SHARE = 0.6, 0.01
 """Least fraction of inliers, and largest noise as a fraction of the focal length, of cameras that fit together."""
+_CLEAR_SHARE, _CLEAR_FOCAL_SHARE = 0.8, 0.003
+"""The same of cameras that were started from given poses and need no comparison with cameras that were not."""
+_CLEARLY_LESS = 0.5
+"""Squared residual, relative to another, from which on it is clearly less."""
 
 
 class ModelSelection:
@@ -77,14 +81,26 @@ class ModelSelection:
             RigError: if the cameras cannot be placed in one rig.
         """
         found, clocks = self._found(clocks)
-        if self._start is not None and not any(map(_fits, found)):
-            given, self._start = (self._start, found), None
-            found, clocks = self._found(clocks)
-            self.start_contradicted = any(map(_fits, found))
-            if not self.start_contradicted:
-                self._start, found = given
+        if self._start is not None and not any(_fits(one, _CLEAR_SHARE, _CLEAR_FOCAL_SHARE) for one in found):
+            found, clocks = self._without_start(found, clocks)
         best = min(found, key=_median_squared_residual)
         return best if set(self.named) <= set(best.refined) else self._with(best, self.named), clocks
+
+    def _without_start(
+        self, found: list[Adjustment], clocks: ClockEstimate | None
+    ) -> tuple[list[Adjustment], ClockEstimate | None]:
+        """What was found from the poses to start from or, where that is clearly better, what is found without them."""
+        start, self._start = self._start, None
+        try:
+            others, own_clocks = self._found(clocks)
+        except RigError:
+            others, own_clocks = [], clocks
+        least = min(map(_median_squared_residual, found))
+        self.start_contradicted = any(_median_squared_residual(other) < _CLEARLY_LESS * least for other in others)
+        if self.start_contradicted:
+            return others, own_clocks
+        self._start = start
+        return found, clocks
 
     def _found(self, clocks: ClockEstimate | None) -> tuple[list[Adjustment], ClockEstimate | None]:
         """What was adjusted at all time offsets that were tried; arguments and errors as of :meth:`adjusted`."""
@@ -160,11 +176,13 @@ class ModelSelection:
         return names
 
 
-def _fits(adjustment: Adjustment) -> bool:
+def _fits(
+    adjustment: Adjustment, least_share: float = _FITTING_SHARE, largest_focal_share: float = _FITTING_FOCAL_SHARE
+) -> bool:
     """Whether the cameras agree with one another as those of one scene do."""
     share = adjustment.last.inliers.sum() / adjustment.measurements.visible.sum()
     noise = adjustment.last.sigma_px.median() / adjustment.measurements.cameras.focal_px.mean()
-    return adjustment.converged and float(share) > _FITTING_SHARE and float(noise) < _FITTING_FOCAL_SHARE
+    return adjustment.converged and float(share) > least_share and float(noise) < largest_focal_share
 
 
 def _median_squared_residual(adjustment: Adjustment) -> float:

@@ -40,7 +40,7 @@ _ROBUST, _SMOOTH = "points", "trajectories"
 _CLOCK_ROUNDS = 10
 _CLOCK_STEP = 0.003
 """Change of the time offsets, in frames, below which they are found."""
-_CLOCK_SIGMAS, _CLOCK_FRAMES = 4.0, 0.01
+_CLOCK_SIGMAS, _CLOCK_FRAMES = 4.0, 0.02
 """Standard deviations, and frames, from which on a time offset is taken for one."""
 _FAR_FRAMES = 0.75
 _STARTS = 3
@@ -147,7 +147,7 @@ def _reconstructed(
     for _ in range(_STARTS):
         begun = _begun(observations, poses, run, offsets)
         adjusted = through([(_ROBUST, robust)], begun, run)
-        clocks = _clocks(adjusted, robust, run, searched=offsets is not None) if timed else None
+        clocks = _clocks(adjusted, robust, run, covariance, searched=offsets is not None) if timed else None
         if clocks is None or not bool((clocks.offsets_frames.abs() > _FAR_FRAMES).any()):
             break
         offsets = begun.frames[0].offsets_frames + clocks.offsets_frames.to(begun.frames[0].offsets_frames)
@@ -194,10 +194,11 @@ def _at(adjustment: Adjustment, offsets_frames: Tensor) -> Adjustment:
     return replace(adjustment, refined=("time_offset",), seen=seen, measurements=measurements, state=state)
 
 
-def _clocks(adjustment: Adjustment, stage: Stage, run: Run, searched: bool) -> _Clocks | None:
+def _clocks(adjustment: Adjustment, stage: Stage, run: Run, covariance: Tensor, searched: bool) -> _Clocks | None:
     """Time offsets of the cameras by the motion of the points, everything else being as it is; None where there are none.
 
-    There are some where frames were chosen by a search, and where time offsets are larger than their standard deviations.
+    There are some where frames were chosen by a search, and where time offsets are larger than their standard deviations, to
+    which the uncertainty (covariance) of the cameras adds.
 
     The points are eliminated, so that a time offset is not hidden in them.
     """
@@ -209,11 +210,13 @@ def _clocks(adjustment: Adjustment, stage: Stage, run: Run, searched: bool) -> _
         if number:
             current = current.ended(run_stage(_ROBUST, stage, current.measurements, current.state, run))
             current = replace(current, results=current.results[-1:])
-        objective = likelihood(current.kept, current.last.losses, current.last.sigma_px)
+        objective = likelihood(current.kept.without_sticks(), current.last.losses, current.last.sigma_px)
         system = NormalEquations(objective, current.state, cameras_free=True)
         poses = 6 * len(offsets)
-        covariance = covariance_of(system.reduced[0, poses:, poses:])
-        step, std = -covariance @ system.reduced_gradient[0, poses:], covariance.diagonal().sqrt()
+        own = covariance_of(system.reduced[0, poses:, poses:])
+        by_poses = own @ system.reduced[0, poses:, :poses]
+        step = -own @ system.reduced_gradient[0, poses:]
+        std = (own + by_poses @ covariance @ by_poses.mT).diagonal().sqrt()
         offsets = offsets + step.clamp(-1.0, 1.0)
         if not searched and number == 0 and not _certain(offsets, std):
             return None
