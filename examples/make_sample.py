@@ -1,11 +1,10 @@
 """Make the recording that `torchstickcal sample` writes: a simulated golf swing, as OpenPose and Pose2Sim write it.
 
-    python examples/make_sample.py torchstickcal/samples/golf.zip
+python examples/make_sample.py torchstickcal/samples/golf.zip
 """
 
 from __future__ import annotations
 
-import io
 import json
 import sys
 import tempfile
@@ -57,7 +56,9 @@ def main() -> None:
                 text = json.dumps({"version": 1.3, "people": [person]}, separators=(",", ":"))
                 put(f"pose/{label}_json/{label}_{frame:06d}.json", text)
         cameras = [
-            RigCamera(label, truth.intrinsics[n], truth.distortion[n], False, (1280, 720), truth.rotations[n], truth.translations[n])
+            RigCamera(
+                label, truth.intrinsics[n], truth.distortion[n], False, (1280, 720), truth.rotations[n], truth.translations[n]
+            )
             for n, label in enumerate(observations.camera_labels)
         ]
         with tempfile.TemporaryDirectory() as folder:

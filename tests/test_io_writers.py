@@ -1,4 +1,4 @@
-"""What is written for other programs is read back as the same rig, whatever it was converted from; points land where they belong."""
+"""What is written for other programs is read back as the same rig, whatever it was converted from; points are where they are."""
 
 from __future__ import annotations
 
@@ -25,7 +25,9 @@ from torchstickcal.simulate import Noise, golf_session
 from torchstickcal.world import World
 
 SIZE = (1280, 720)
-CAMERA_FORMATS = sorted(name for name, writer in CALIBRATION_WRITERS.items() if writer.writes == "cameras" and name != "blender")
+CAMERA_FORMATS = sorted(
+    name for name, writer in CALIBRATION_WRITERS.items() if writer.writes == "cameras" and name != "blender"
+)
 UNITS = {"pose2sim": "m", "anipose": "m", "freemocap": "mm", "caliscope": "m", "easymocap": "m", "opencap": "mm"}
 """What a reader knows without being told; COLMAP, nerfstudio and OpenCV do not say it."""
 
@@ -126,7 +128,9 @@ def test_a_pose_of_half_a_turn_is_written_exactly(tmp_path: Path):
     turns = [[np.pi, 0, 0], [0, np.pi, 0], [0, 0, np.pi], [np.pi / np.sqrt(2), np.pi / np.sqrt(2), 0], [0, 0, 0]]
     names = tuple(f"cam{number}" for number in range(5))
     cameras = rig(names)
-    given = replace(cameras, rotations=torch.stack([torch.from_numpy(cv2.Rodrigues(np.array(turn, dtype=float))[0]) for turn in turns]))
+    given = replace(
+        cameras, rotations=torch.stack([torch.from_numpy(cv2.Rodrigues(np.array(turn, dtype=float))[0]) for turn in turns])
+    )
     for format in CAMERA_FORMATS:
         (tmp_path / format).mkdir()
         check_same(read_calibration(written(given, format, tmp_path / format)), given, 1e-7)

@@ -108,7 +108,9 @@ def test_up_and_floor_of_every_sport(sport: str, path: str):
     """With cameras on tripods: up within 1 degree, the floor within 3 cm, and nobody upside down."""
     truth = SessionSpec(sport, sport, seed=3, path=path, layout="ring").generate()
     own, true = frame(), truth.truth
-    found = athlete_frame(own.points(true.points), truth.observations.point_names, own.poses(true.rotations, true.translations)[0])
+    found = athlete_frame(
+        own.points(true.points), truth.observations.point_names, own.poses(true.rotations, true.translations)[0]
+    )
     up = found.rotation[2]
     assert error_deg(up, own.rotation[:, 2]) < 1.0
     floor = own.points(torch.zeros(1, 3, dtype=torch.float64) + true.points[0, [15, 18]].mean(0) * torch.tensor([1.0, 1, 0]))

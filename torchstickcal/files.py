@@ -40,8 +40,8 @@ def atomic_path(path: str | Path) -> Iterator[Path]:
 def atomic_set(folder: str | Path) -> Iterator[Path]:
     """A temporary folder for files that belong together. They take their places in ``folder`` if the block succeeds.
 
-    Files of the same names are replaced; others in ``folder`` stay as they are. ``folder`` is created if it does not exist. There
-    may be folders among them, for whose files the same holds.
+    Files of the same names are replaced; others in ``folder`` stay as they are. ``folder`` is created if it does not exist.
+    There may be folders among them, for whose files the same holds.
 
     If the block fails or is interrupted, the disk is full, or a file cannot be replaced, ``folder`` is as before. No operating
     system exchanges several files at once: where the process is killed or the machine stops during the exchange, which takes a

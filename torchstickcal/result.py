@@ -80,6 +80,7 @@ class CameraParameter:
         return tensor.view(len(tensor), -1)
 
 
+_CAMERA_WORLD = World()
 _UNKNOWN = "unknown_"
 _PARAMETER_TENSORS = ("value", "std", "given", "prior_std", "suggested", "suggested_std")
 
@@ -113,8 +114,8 @@ class Calibration:
     frames of the session, unless time offsets were estimated or timestamps were given."""
     covariance: Tensor
     """(6 (C - 1), 6 (C - 1)), float64, of the tangents (translation, rotation; metres, radians) of all cameras but the first,
-    relative to which the others are uncertain: ``T_true = T Exp(tangent)``. It contains errors of the keypoints that last for several frames, and the
-    stated deviations of the sticks' lengths, which are common to all frames."""
+    relative to which the others are uncertain: ``T_true = T Exp(tangent)``. It contains errors of the keypoints that last for
+    several frames, and the stated deviations of the sticks' lengths, which are common to all frames."""
     residuals_px: Tensor
     """(C, F, P, 2), projection minus keypoint, pixels, of inliers and outliers; NaN where not seen or the point is not known"""
     inliers: Tensor
@@ -154,16 +155,16 @@ class Calibration:
     """time of the initialisation, of the search for label errors, of each stage and in total"""
     warnings: tuple[str, ...]
     """what a careful user should know"""
-    world: World = World()
+    world: World = _CAMERA_WORLD
     """the frame of cameras and points: where its origin is and how its axes lie"""
 
     def in_world(self, world: str | Frame) -> Calibration:
         """The same calibration in another frame: poses, points and covariance.
 
         Args:
-            world: ``camera``: the frame of the first camera. ``athlete``: z up, the origin on the floor below the athlete's feet
-                in the first frame, x where the athlete faces. ``floor``: z up, the origin on the floor below the first camera, x
-                in its viewing direction. Or a frame, from :func:`torchstickcal.world.frame_of_points` or
+            world: ``camera``: the frame of the first camera. ``athlete``: z up, the origin on the floor below the athlete's
+                feet in the first frame, x where the athlete faces. ``floor``: z up, the origin on the floor below the first
+                camera, x in its viewing direction. Or a frame, from :func:`torchstickcal.world.frame_of_points` or
                 :func:`torchstickcal.world.frame_of_cameras`.
 
         Raises:

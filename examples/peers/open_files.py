@@ -37,8 +37,7 @@ def pose2sim(folder: Path) -> Iterator[Pose]:
     from Pose2Sim.common import retrieve_calib_params
 
     found = retrieve_calib_params(folder / "calibration.toml")
-    for name, matrix, translation in zip(names(folder), found["R_mat"], found["T"], strict=True):
-        yield name, matrix, translation
+    yield from zip(names(folder), found["R_mat"], found["T"], strict=True)
 
 
 def caliscope(folder: Path) -> Iterator[Pose]:
@@ -105,7 +104,7 @@ def compared(folder: Path, found: list[Pose]) -> str:
         return f"other cameras: {[name for name, _, _ in found]}"
     turns = [np.abs(matrix - ours[name][0]).max() for name, matrix, _ in found]
     shifts = [np.abs(translation - ours[name][1]).max() for name, _, translation in found]
-    return f"{len(found)} cameras; largest difference of a rotation's entries {max(turns):.1e}, of translations {max(shifts):.1e} m"
+    return f"{len(found)} cameras; largest difference of rotations {max(turns):.1e}, of translations {max(shifts):.1e} m"
 
 
 def points(folder: Path) -> None:

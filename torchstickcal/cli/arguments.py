@@ -21,7 +21,7 @@ from torchstickcal.cli.triangulate import triangulate_session
 class _Parser(argparse.ArgumentParser):
     """A parser whose errors are one line, as those of the commands."""
 
-    def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:
+    def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:  # pyright: ignore[reportIncompatibleMethodOverride]
         """Parse arguments; ``--world points FILE`` is one option with one value."""
         return super().parse_known_args(None if args is None else _with_files_of_worlds(list(args)), namespace)
 
@@ -51,7 +51,18 @@ def parser() -> argparse.ArgumentParser:
         description="Calibrate a camera rig, in metres, from an athlete's keypoints and a stick of known length.",
     )
     commands = parser.add_subparsers(metavar="COMMAND", required=True)
-    for add in (_add_calibrate, _add_triangulate, _add_info, _add_convert, _add_sample, _add_evaluate, _add_benchmark, _add_simulate, _add_demo, _add_list):
+    for add in (
+        _add_calibrate,
+        _add_triangulate,
+        _add_info,
+        _add_convert,
+        _add_sample,
+        _add_evaluate,
+        _add_benchmark,
+        _add_simulate,
+        _add_demo,
+        _add_list,
+    ):
         add(commands)
     return parser
 
@@ -86,8 +97,8 @@ def _add_calibrate(commands: Any) -> None:
         "--world",
         metavar="camera|athlete|floor|points FILE|calibration FILE",
         default="athlete",
-        help="frame of the results: of the first camera; of the athlete: z up, the origin on the floor below the feet at first, x "
-        "where the athlete faces; of the floor: z up, the origin below the first camera; of points at known places (.csv); of "
+        help="frame of the results: of the first camera; of the athlete: z up, the origin on the floor below the feet at first, "
+        "x where the athlete faces; of the floor: z up, the origin below the first camera; of points at known places (.csv); of "
         "another calibration of the same cameras (default: athlete, where head and ankles are known)",
     )
     command.add_argument(
@@ -118,7 +129,7 @@ def _add_triangulate(commands: Any) -> None:
     command = commands.add_parser(
         "triangulate",
         help="find the points of a recording by cameras that were calibrated before",
-        description="Find the points of a recording, in metres, by cameras that were calibrated before and have not been moved.",
+        description="Find the points of a recording, in metres, by cameras that were calibrated before and not moved since.",
     )
     command.add_argument(
         "session", metavar="SESSION", type=_path, nargs="+", help="file or folder of a recording; or one file for each camera"

@@ -93,8 +93,8 @@ def check_frame_rate(writers: dict[str, Writer], observations: Observations) -> 
 
 
 def result_names(writers: dict[str, Writer]) -> list[str]:
-    """The names of the files and folders that :func:`write_results` writes."""
-    return [*writers, POINTS_FILE, REPORT_FILE]
+    """The names of the single files that :func:`write_results` writes; folders of several files are not among them."""
+    return [*(name for name, writer in writers.items() if not writer.files), POINTS_FILE, REPORT_FILE]
 
 
 def write_results(calibration: Calibration, folder: Path, writers: dict[str, Writer], provenance: dict[str, Any]) -> None:
@@ -111,7 +111,7 @@ def show_results(calibration: Calibration, folder: Path, writers: dict[str, Writ
     from torchstickcal.show.report import table
 
     print(table(calibration))
-    print(f"\n{', '.join(result_names(writers))} in {folder}")
+    print(f"\n{', '.join([*writers, POINTS_FILE, REPORT_FILE])} in {folder}")
     if calibration.converged:
         return EXIT_DONE
     print(f"not converged: {calibration.status}", file=sys.stderr)

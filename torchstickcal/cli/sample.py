@@ -21,5 +21,7 @@ def sample(options: argparse.Namespace) -> int:
     with atomic_set(folder) as temporary, zipfile.ZipFile(io.BytesIO(content)) as archive:
         archive.extractall(temporary)
     print(f"A golf swing seen by four cameras, in {folder}. To calibrate it:\n")
-    print(f"torchstickcal calibrate {folder} --skeleton {folder / 'skeleton.toml'} --stick club_grip club_head 1.0 --out results")
+    print(
+        f"torchstickcal calibrate {folder} --skeleton {folder / 'skeleton.toml'} --stick club_grip club_head 1.0 --out results"
+    )
     return EXIT_DONE

@@ -13,7 +13,7 @@ from torchstickcal.io.rig import Rig
 
 _SENSOR_MM = 36.0
 _TURN = np.diag([1.0, -1.0, -1.0])
-_SCRIPT = '''import bpy
+_SCRIPT = """import bpy
 from mathutils import Matrix
 
 for name, (width, height), lens_mm, sensor_fit, shift, matrix in CAMERAS:
@@ -26,7 +26,7 @@ for name, (width, height), lens_mm, sensor_fit, shift, matrix in CAMERAS:
     bpy.context.collection.objects.link(camera)
     bpy.context.scene.render.resolution_x, bpy.context.scene.render.resolution_y = width, height
     bpy.context.scene.camera = camera
-'''
+"""
 
 
 @camera_writer("blender", "a Python script that makes the cameras in Blender, in metres", file_name="blender_cameras.py")

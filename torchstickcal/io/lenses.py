@@ -67,8 +67,8 @@ def lenses_of(
         turned: how images were turned after the calibration, a key of :data:`TURNS`; None for not at all.
 
     Raises:
-        CalibrationError: if a camera is missing, lenses of both models are mixed, or images were cut, or turned in a way that is
-            not said.
+        CalibrationError: if a camera is missing, lenses of both models are mixed, or images were cut, or turned in a way that
+            is not said.
     """
     cameras, notes = arranged(rig, labels, image_size, turned)
     models = {fisheye for fisheye, lens in zip(cameras.fisheye, cameras.distortion, strict=True) if bool((lens != 0).any())}
@@ -101,9 +101,7 @@ def arranged(
     unknown = torch.full((len(order), 2), torch.nan, dtype=torch.float64)
     calibrated = unknown if rig.image_size is None else rig.image_size[order].clone()
     matrices, lenses = rig.intrinsics[order].clone(), [rig.distortion[index] for index in order]
-    rotations, translations = (
-        None if poses is None else poses[order].clone() for poses in (rig.rotations, rig.translations)
-    )
+    rotations, translations = (None if poses is None else poses[order].clone() for poses in (rig.rotations, rig.translations))
     if turned is not None:
         turn = _turn(turned)
         for camera, label in enumerate(names):

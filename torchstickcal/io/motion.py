@@ -101,9 +101,11 @@ class Motion:
 
     def known(self) -> Motion:
         """The points that are known in some frame."""
-        kept = np.isfinite(self.points).all(-1).any(0)
+        kept = np.asarray(np.isfinite(self.points).all(-1).any(0))
         names = tuple(name for name, keep in zip(self.names, kept, strict=True) if keep)
-        return replace(self, points=self.points[:, kept], names=names, std_m=None if self.std_m is None else self.std_m[:, kept])
+        return replace(
+            self, points=self.points[:, kept], names=names, std_m=None if self.std_m is None else self.std_m[:, kept]
+        )
 
     def with_y_up(self) -> Motion:
         """The same with y up: z of the frame becomes y; in the frame of a camera, y and z are turned round.

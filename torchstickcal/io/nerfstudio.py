@@ -43,7 +43,10 @@ def write_nerfstudio(path: Path, rig: Rig) -> None:
     rig.check_plain("nerfstudio")
     if len(set(rig.fisheye)) > 1:
         raise CalibrationError(
-            "lenses of both models in one file", where="nerfstudio", got="fisheye and other lenses", expected="lenses of one model"
+            "lenses of both models in one file",
+            where="nerfstudio",
+            got="fisheye and other lenses",
+            expected="lenses of one model",
         )
     rotations, translations = rig.in_metres().poses()
     frames = []

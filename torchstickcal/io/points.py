@@ -61,7 +61,7 @@ def write_c3d(path: Path, motion: Motion) -> None:
         ) from error
     motion = motion.evenly("C3D")
     frames, points = motion.points.shape[:2]
-    known = np.isfinite(motion.points).all(-1)
+    known = np.asarray(np.isfinite(motion.points).all(-1))
     data = np.ones((4, points, frames))
     data[:3] = np.moveaxis(np.where(known[..., None], _PER_METRE * motion.points, 0.0), -1, 0).swapaxes(1, 2)
     std = np.zeros_like(known, dtype=np.float64) if motion.std_m is None else np.nan_to_num(motion.std_m)
@@ -102,7 +102,11 @@ def write_csv(path: Path, motion: Motion) -> None:
 @point_writer("npz", "points as arrays of NumPy, in metres (.npz)", file_name="points_m.npz")
 def write_point_arrays(path: Path, motion: Motion) -> None:
     """Write ``points_m`` (G, P, 3), ``std_m`` (G, P), ``times_s`` (G,), ``names`` (P,) and ``about``, a text in JSON."""
-    arrays = {"points_m": motion.points, "names": np.array(motion.names), "about": np.array(json.dumps(about("metres", motion.world)))}
+    arrays = {
+        "points_m": motion.points,
+        "names": np.array(motion.names),
+        "about": np.array(json.dumps(about("metres", motion.world))),
+    }
     if motion.std_m is not None:
         arrays["std_m"] = motion.std_m
     if motion.times is not None:

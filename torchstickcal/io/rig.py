@@ -136,7 +136,9 @@ class Rig:
             got = f"a skew of {float(matrix[0, 1]):g} pixels" if matrix[0, 1] else "a fisheye lens"
             if bool(matrix[0, 1]) or (is_fisheye and not fisheye):
                 expected = "pixels at right angles" if matrix[0, 1] else "OpenCV's usual lens model"
-                raise CalibrationError("a camera that the format cannot hold", where=f"{what}, {name}", got=got, expected=expected)
+                raise CalibrationError(
+                    "a camera that the format cannot hold", where=f"{what}, {name}", got=got, expected=expected
+                )
 
     @classmethod
     def of(cls, cameras: Sequence[RigCamera], unit: str | None = "m") -> Rig:

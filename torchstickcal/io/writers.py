@@ -89,7 +89,7 @@ class Writer:
 
 
 CALIBRATION_WRITERS: Registry[Writer] = Registry("output format", "torchstickcal.io")
-"""The formats that can be written, by name. :func:`calibration_writer`, :func:`camera_writer` and :func:`point_writer` add one."""
+"""The formats that can be written, by name. :func:`calibration_writer`, :func:`camera_writer`, :func:`point_writer` add one."""
 
 _Function = TypeVar("_Function", bound=Callable[..., None])
 

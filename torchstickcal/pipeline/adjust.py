@@ -220,8 +220,8 @@ def begin(
         refined: what is to be estimated of the cameras beside their poses.
         offsets_frames: (C,), time offsets of the cameras' frames, in frames; None for those given.
         start: an earlier estimate; None to estimate the rig from nothing.
-        poses: rotations (C, 3, 3) and translations (C, 3) to start from, up to scale, with the first camera as the world; None to
-            estimate them from nothing.
+        poses: rotations (C, 3, 3) and translations (C, 3) to start from, up to scale, with the first camera as the world; None
+            to estimate them from nothing.
 
     Raises:
         ConfigError: if nothing sets the scale, and if there are camera groups, but not a label for each camera.
@@ -237,7 +237,9 @@ def begin(
     elif poses is not None:
         rotations, translations = poses[0][None].double(), poses[1][None].double()
         state = State.of(rotations, translations, triangulated(seen, rotations, translations, config.initialise))
-        refined = refined if observations.intrinsics_known or "focal" in refined else with_refinements(refined, ("focal_shared",))
+        refined = (
+            refined if observations.intrinsics_known or "focal" in refined else with_refinements(refined, ("focal_shared",))
+        )
     elif observations.intrinsics_known:
         state = initialise(seen, config.initialise, observations.camera_labels)
     else:

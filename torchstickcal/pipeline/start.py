@@ -19,8 +19,8 @@ Poses = tuple[Tensor, Tensor]
 """Rotations (C, 3, 3) and translations (C, 3), world to camera."""
 
 CONTRADICTED_START = (
-    "The keypoints contradict the poses that were given as a start, which were not used. Check that they are of the same cameras, "
-    "and that none has been moved since."
+    "The keypoints contradict the poses that were given as a start, which were not used. Check that they are of the same "
+    "cameras, and that none has been moved since."
 )
 _LEAST_DISTANCE = 1e-9
 
@@ -45,7 +45,9 @@ def starting_from(initial: Calibration | Rig, observations: Observations) -> tup
         expected = f"{observations.num_cameras} cameras"
         raise CalibrationError("a start with another number of cameras", where="initial", got=len(rig.names), expected=expected)
     if rig.rotations is None or rig.translations is None:
-        raise CalibrationError("a start without poses", where="initial", got="intrinsics alone", expected="poses of all cameras")
+        raise CalibrationError(
+            "a start without poses", where="initial", got="intrinsics alone", expected="poses of all cameras"
+        )
     rotations, translations = rig.rotations, rig.translations
     from_first = rotations @ rotations[0].mT
     translations = translations - from_first @ translations[0]
@@ -53,11 +55,18 @@ def starting_from(initial: Calibration | Rig, observations: Observations) -> tup
     spread = float(centres.square().sum(-1).mean().sqrt())
     if not spread > _LEAST_DISTANCE:
         raise CalibrationError(
-            "a start whose cameras are all in one place", where="initial", got=f"distances of {spread:g}", expected="different places"
+            "a start whose cameras are all in one place",
+            where="initial",
+            got=f"distances of {spread:g}",
+            expected="different places",
         )
     if not known:
         lenses, _ = lenses_of(rig, rig.names, None)
         observations = replace(
-            observations, intrinsics=lenses.intrinsics, distortion=lenses.distortion, fisheye=lenses.fisheye, intrinsics_known=False
+            observations,
+            intrinsics=lenses.intrinsics,
+            distortion=lenses.distortion,
+            fisheye=lenses.fisheye,
+            intrinsics_known=False,
         )
     return observations, (from_first.to(device), (translations / spread).to(device))

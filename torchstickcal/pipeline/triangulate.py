@@ -98,9 +98,9 @@ def triangulate(
         readout_s=_readout(calibration, observations, lenses.image_size),
     )
     device = observations.keypoints.device
-    poses = tuple(part.to(device) for part in rig.poses())
+    rotations, translations = (part.to(device) for part in rig.poses())
     world = calibration.world if isinstance(calibration, Calibration) else rig.world
-    found = on_worker(device, _reconstructed, given, poses, covariance.to(device), load_config(config))
+    found = on_worker(device, _reconstructed, given, (rotations, translations), covariance.to(device), load_config(config))
     return replace(found, world=world or found.world, warnings=(*notes, *found.warnings), sticks=observations.sticks)
 
 
@@ -144,13 +144,12 @@ def _reconstructed(
         seen, reach = measured(frames, config), config.max_offset_s * frames.rate_hz
         if unsynchronised(seen, reach):
             offsets = search_offsets(seen, reach).likeliest_frames.to(observations.keypoints.device)
-    for _ in range(_STARTS):
-        begun = _begun(observations, poses, run, offsets)
-        adjusted = through([(_ROBUST, robust)], begun, run)
-        clocks = _clocks(adjusted, robust, run, covariance, searched=offsets is not None) if timed else None
+    adjusted, clocks = _placed(observations, poses, run, robust, covariance, offsets, timed)
+    for _ in range(_STARTS - 1):
         if clocks is None or not bool((clocks.offsets_frames.abs() > _FAR_FRAMES).any()):
             break
-        offsets = begun.frames[0].offsets_frames + clocks.offsets_frames.to(begun.frames[0].offsets_frames)
+        offsets = adjusted.frames[0].offsets_frames + clocks.offsets_frames
+        adjusted, clocks = _placed(observations, poses, run, robust, covariance, offsets, timed)
     if clocks is not None:
         adjusted = _at(adjusted, clocks.offsets_frames)
         adjusted = through([(_ROBUST, robust)], replace(adjusted, results=(), records=((),)), run)
@@ -167,6 +166,21 @@ def _stages(config: Config) -> tuple[Stage, Stage | None]:
     robust = {name: loss for name, loss in points.items() if not issubclass(loss.loss, TrackLoss)}
     first = replace(last, cameras="held", losses=robust, rescale=False)
     return first, (replace(first, losses=points) if len(points) > len(robust) else None)
+
+
+def _placed(
+    observations: Observations,
+    poses: tuple[Tensor, Tensor],
+    run: Run,
+    stage: Stage,
+    covariance: Tensor,
+    offsets: Tensor | None,
+    timed: bool,
+) -> tuple[Adjustment, _Clocks | None]:
+    """A recording after its first stage, at some time offsets (C,) of the frames, and the time offsets beyond these."""
+    adjusted = through([(_ROBUST, stage)], _begun(observations, poses, run, offsets), run)
+    clocks = _clocks(adjusted, stage, run, covariance, searched=offsets is not None) if timed else None
+    return adjusted, clocks
 
 
 def _begun(observations: Observations, poses: tuple[Tensor, Tensor], run: Run, offsets: Tensor | None) -> Adjustment:
@@ -272,4 +286,3 @@ def _concluded(ended: Adjustment, clocks: _Clocks | None, covariance: Tensor) ->
         world=World(),
         warnings=keypoint_warnings(ended),
     )
-

@@ -1,1 +1,1 @@
-"""A small recording, as other programs write it. ``examples/make_sample.py`` makes it; ``torchstickcal sample`` writes it out."""
+"""A small recording that ``torchstickcal sample`` writes out. It is made by ``examples/make_sample.py``."""

@@ -43,7 +43,13 @@ def summary(found: Reconstruction) -> dict[str, Any]:
     return {
         "world": dataclasses.asdict(found.world),
         "cameras": [
-            {"name": name, "reprojection_median_px": median, "keypoints": used, "time_offset_s": offset, "time_offset_std_s": std}
+            {
+                "name": name,
+                "reprojection_median_px": median,
+                "keypoints": used,
+                "time_offset_s": offset,
+                "time_offset_std_s": std,
+            }
             for name, median, used, (offset, std) in zip(
                 found.camera_names, map(finite, found.reprojection_median_px), _used(found), offsets, strict=True
             )

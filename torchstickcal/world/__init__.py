@@ -1,4 +1,4 @@
-"""The frame of the world in which a calibration is given: of the first camera, of the athlete, or of what is known of the scene.
+"""The frame in which a calibration is given: of the first camera, of the athlete, or of what is known of the scene.
 
 Estimation needs none of it: it happens in the frame of the first camera.
 """

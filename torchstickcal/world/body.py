@@ -13,7 +13,7 @@ from torchstickcal.skeletons import conventional
 
 _HEAD = ("head_top", "head", "nose", "left_ear", "right_ear", "left_eye", "right_eye")
 _FEET = {"ankle": 0.044, "heel": 0.019, "big_toe": 0.013, "small_toe": 0.013, "foot_index": 0.013}
-"""Points of a foot, and their heights above the floor when it stands flat, as shares of the height of the head above the ankles."""
+"""Points of a foot, and their heights above the floor when it stands flat, in heights of the head above the ankles."""
 _HIPS = ("hip", "pelvis")
 _MASS = {"head": 0.08, "shoulder": 0.28, "hip": 0.36, "knee": 0.14, "ankle": 0.07, "elbow": 0.04, "wrist": 0.03}
 """Shares of the mass of a body, put into its joints."""
@@ -23,7 +23,7 @@ _LEAST_SHARE = 0.5
 _ANKLE_TO_MIDDLE = 0.03
 """How far the middle of a foot is in front of its ankle, as a share of the same height."""
 _LIFTED, _LIFTED_SCALE = 0.12, 0.02
-"""Difference of height from which a foot carries less than the other, which no error of the vertical explains, in these heights."""
+"""Difference of height from which a foot carries less than the other: more than an error of the vertical explains."""
 _STEP, _MOVED = 3, 0.02
 """Frames before and after in which a foot that carries moves less than so many of these heights."""
 _UPRIGHT = 0.9
@@ -79,7 +79,11 @@ class Body:
             )
         known = (head - ankles).norm(dim=-1)
         height_m = float(known[known.isfinite()].quantile(_UPRIGHT))
-        track, head, ankles = {name: positions / height_m for name, positions in track.items()}, head / height_m, ankles / height_m
+        track, head, ankles = (
+            {name: positions / height_m for name, positions in track.items()},
+            head / height_m,
+            ankles / height_m,
+        )
         trunk = [joint for joint in ("hip", "shoulder") if {f"left_{joint}", f"right_{joint}"} <= set(track)]
         left = _known_mean([track[f"left_{joint}"] - track[f"right_{joint}"] for joint in trunk or ["ankle"]])
         joints = {name: middle(*_HIPS) if name == "hip" else head if name == "head" else middle(name) for name in _MASS}
@@ -87,7 +91,8 @@ class Body:
         for arm in _ARMS:
             if arm in needed and float(needed[arm].isfinite().all(-1).double().mean()) < _LEAST_SHARE:
                 del needed[arm]
-        mass = sum(_MASS[name] * joint for name, joint in needed.items()) / sum(map(_MASS.__getitem__, needed))
+        masses = torch.stack([_MASS[name] * joint for name, joint in needed.items()]).sum(0)
+        mass = masses / sum(map(_MASS.__getitem__, needed))
         whole = {"head", "shoulder", "hip", "ankle"} <= set(needed)
         both = torch.stack([track.get(f"{side}_ankle", ankles) for side in ("left", "right")])
         feet = tuple(

@@ -104,7 +104,7 @@ def _footholds(body: Body, up: Tensor, along: Tensor) -> tuple[Tensor, Tensor]:
         return torch.zeros(2, 2, dtype=torch.float64), torch.zeros(2, dtype=torch.float64)
     points = torch.stack(places)
     heights, flat = points @ up, points @ along.mT
-    weights = torch.ones_like(heights)
+    weights, residuals = torch.ones_like(heights), heights
     for _ in range(3):
         residuals = heights - (weights * heights).sum() / weights.sum()
         weights = 1 / (1 + residuals.square() / (_CUT * _FOOTHOLD) ** 2).square()
