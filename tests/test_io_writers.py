@@ -1,4 +1,4 @@
-"""What is written for other programs is read back as the same rig, whatever it was converted from; points are where they are."""
+"""What is written for other programs is read back as the same rig, whatever it was converted from; so are points."""
 
 from __future__ import annotations
 

@@ -176,7 +176,7 @@ class Calibration:
             >>> from torchstickcal.simulate import golf_session
             >>> calibration = calibrate(golf_session(cameras=3, frames=30)[0]).in_world("athlete")
             >>> head = calibration.points[0, calibration.point_names.index("head_top")]
-            >>> calibration.world.name, 1.4 < head[2] < 1.8, bool((calibration.camera_centres[:, 2] > 0).all())
+            >>> calibration.world.name, bool(1.4 < head[2] < 1.8), bool((calibration.camera_centres[:, 2] > 0).all())
             ('athlete', True, True)
         """
         frame = self._frame(world) if isinstance(world, str) else world

@@ -93,12 +93,13 @@ def _add_calibrate(commands: Any) -> None:
         help="standard deviation of that length in metres: how well it is known (default: the session's)",
     )
     _add_write(command, "the calibration and its points also")
+    command.add_argument("--export", metavar="A,B", help="as --write")
     command.add_argument(
         "--world",
         metavar="camera|athlete|floor|points FILE|calibration FILE",
         default="athlete",
-        help="frame of the results: of the first camera; of the athlete: z up, the origin on the floor below the feet at first, "
-        "x where the athlete faces; of the floor: z up, the origin below the first camera; of points at known places (.csv); of "
+        help="frame of the results: of the first camera; of the athlete: z up, the origin on the floor below the feet at "
+        "first, x where the athlete faces; of the floor: z up, the origin below the first camera; of points at known places (.csv); of "
         "another calibration of the same cameras (default: athlete, where head and ankles are known)",
     )
     command.add_argument(
@@ -283,7 +284,6 @@ def _add_format(command: argparse.ArgumentParser, what: str) -> None:
 def _add_write(command: argparse.ArgumentParser, what: str) -> None:
     command.add_argument(
         "--write",
-        "--export",
         metavar="A,B",
         help=f"write {what} in these formats, from `torchstickcal list formats`, or into files whose names say their formats",
     )

@@ -29,7 +29,7 @@ def calibrate_session(options: argparse.Namespace) -> int:
     from torchstickcal.pipeline.calibrate import calibrate
 
     config, refine = _refining(load_config(options.config), options.refine, options.no_sync)
-    writers, world = chosen_writers(options.write), world_of(options.world, options.units)
+    writers, world = chosen_writers(options.export, options.write), world_of(options.world, options.units)
     initial = initial_of(options.initial)
     try_writing(options.out, result_names(writers))
     if options.tensorboard is not None:

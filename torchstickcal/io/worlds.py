@@ -23,8 +23,8 @@ def world_of_points(path: str | Path) -> Callable[[Calibration], Frame]:
     """The frame of points whose positions a table gives.
 
     Args:
-        path: of a table (.csv) with the columns point, x, y, z (metres), and frame if a point is there in this frame alone, such
-            as the ends of a stick on marks. Without a frame the point is at rest.
+        path: of a table (.csv) with the columns point, x, y, z (metres), and frame if a point is there in this frame alone,
+            such as the ends of a stick on marks. Without a frame the point is at rest.
 
     Returns:
         A function that finds the frame for a calibration. It raises a CalibrationError if a point is none of the calibration's.

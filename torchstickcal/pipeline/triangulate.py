@@ -71,6 +71,7 @@ def triangulate(
         ObservationError: if no two cameras have a frame in common.
 
     Example:
+        >>> from torchstickcal import calibrate
         >>> from torchstickcal.simulate import golf_session
         >>> observations, truth = golf_session(cameras=3, frames=30)
         >>> calibration = calibrate(observations)
