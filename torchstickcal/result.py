@@ -155,6 +155,9 @@ class Calibration:
     """time of the initialisation, of the search for label errors, of each stage and in total"""
     warnings: tuple[str, ...]
     """what a careful user should know"""
+    left_out: tuple[str, ...] = ()
+    """names of the cameras that share too little with the others, where only the largest part was to be calibrated. They are in
+    no other part of the result."""
     world: World = _CAMERA_WORLD
     """the frame of cameras and points: where its origin is and how its axes lie"""
 
@@ -338,6 +341,7 @@ class Calibration:
             "stages": [dataclasses.asdict(stage) | {"stop": stage.stop.name} for stage in self.stages],
             "seconds": self.seconds,
             "warnings": self.warnings,
+            "left_out": self.left_out,
             "world": dataclasses.asdict(self.world),
         }
         with atomic_path(path) as temporary, temporary.open("wb") as file:
@@ -372,6 +376,7 @@ class Calibration:
                 stages=tuple(_stage_record(stage) for stage in _checked(meta["stages"], list)),
                 seconds=_numbers(meta["seconds"]),
                 warnings=_texts(meta["warnings"]),
+                left_out=_texts(meta["left_out"]),
                 world=_world(meta["world"]),
             )
             counts = {"C": calibration.camera_names, "P": calibration.point_names, "S": calibration.sticks}

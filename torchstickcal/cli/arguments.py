@@ -99,8 +99,8 @@ def _add_calibrate(commands: Any) -> None:
         metavar="camera|athlete|floor|points FILE|calibration FILE",
         default="athlete",
         help="frame of the results: of the first camera; of the athlete: z up, the origin on the floor below the feet at "
-        "first, x where the athlete faces; of the floor: z up, the origin below the first camera; of points at known places (.csv); of "
-        "another calibration of the same cameras (default: athlete, where head and ankles are known)",
+        "first, x where the athlete faces; of the floor: z up, the origin below the first camera; of points at known places "
+        "(.csv); of another calibration of the same cameras (default: athlete, where head and ankles are known)",
     )
     command.add_argument(
         "--initial", metavar="FILE", type=_path, help="calibration from whose poses to start; they may be up to scale"

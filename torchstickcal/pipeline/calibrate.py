@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, Protocol
 
 from torchstickcal.config import Config, Refine, load_config, with_refine
+from torchstickcal.errors import RigError
 from torchstickcal.losses import LOSSES
 from torchstickcal.model.unknowns import REFINEMENTS
 from torchstickcal.observations import Observations
@@ -84,10 +85,32 @@ def calibrate(
     start = None
     if initial is not None:
         observations, start = starting_from(initial, observations)
-    return on_worker(observations.keypoints.device, _calibrated, observations, settings, callback, start)
+    calibrated = _calibrated if settings.incomplete == "refuse" else _largest_part
+    return on_worker(observations.keypoints.device, calibrated, observations, settings, callback, start)
 
 
-def _calibrated(observations: Observations, config: Config, callback: Callback | None, start: Poses | None) -> Calibration:
+def _largest_part(
+    observations: Observations, config: Config, callback: Callback | None, start: Poses | None = None
+) -> Calibration:
+    """All cameras, or where they are no one rig, those of its largest part."""
+    try:
+        return _calibrated(observations, config, callback, start)
+    except RigError as error:
+        if not error.parts or len(error.parts[-1]) < 2:
+            raise
+        left_out = tuple(name for part in error.parts[:-1] for name in part)
+    cameras = [camera for camera, name in enumerate(observations.camera_labels) if name not in left_out]
+    groups = [config.camera_groups[camera] for camera in cameras] if config.camera_groups else []
+    return _calibrated(observations.of_cameras(cameras), replace(config, camera_groups=groups), callback, None, left_out)
+
+
+def _calibrated(
+    observations: Observations,
+    config: Config,
+    callback: Callback | None,
+    start: Poses | None = None,
+    left_out: tuple[str, ...] = (),
+) -> Calibration:
     began = time.perf_counter()
     run = Run(config, callback.on_iteration if callback else ignore_record)
     models = ModelSelection(observations, run, start)
@@ -109,7 +132,7 @@ def _calibrated(observations: Observations, config: Config, callback: Callback |
     # 6. Conclude: covariance, warnings, and the result in the caller's dtype.
     unsynchronised = config.synchronise and "time_offset" not in ended.refined and models.unsynchronised
     run.took("total", time.perf_counter() - began)
-    calibration = conclude(ended, check, clocks, unsynchronised, run.seconds)
+    calibration = conclude(ended, check, clocks, unsynchronised, left_out, run.seconds)
     if models.start_contradicted:
         calibration = replace(calibration, warnings=(*calibration.warnings, CONTRADICTED_START))
     if callback:

@@ -7,8 +7,9 @@ from typing import Any
 
 from torch import Tensor
 
+from torchstickcal.files import without_nan
 from torchstickcal.reconstruction import Reconstruction
-from torchstickcal.show.report import aligned, finite, printable
+from torchstickcal.show.report import aligned, printable
 
 
 def table(found: Reconstruction) -> str:
@@ -39,37 +40,39 @@ def table(found: Reconstruction) -> str:
 
 def summary(found: Reconstruction) -> dict[str, Any]:
     """What was triangulated without its arrays, as JSON can hold it."""
-    offsets = zip(found.time_offsets.tolist(), map(finite, found.time_offsets_std), strict=True)
-    return {
-        "world": dataclasses.asdict(found.world),
-        "cameras": [
-            {
-                "name": name,
-                "reprojection_median_px": median,
-                "keypoints": used,
-                "time_offset_s": offset,
-                "time_offset_std_s": std,
-            }
-            for name, median, used, (offset, std) in zip(
-                found.camera_names, map(finite, found.reprojection_median_px), _used(found), offsets, strict=True
-            )
-        ],
-        "points": [
-            {"name": name, "frames": frames, "std_m": std, "sigma_px": sigma}
-            for name, frames, std, sigma in zip(
-                _names(found),
-                _frames(found),
-                map(finite, found.points_std_m.nanmedian(0).values),
-                found.sigma_px.tolist(),
-                strict=True,
-            )
-        ],
-        "sticks": [
-            {"start": stick.ends[0], "end": stick.ends[1], "length_m": stick.length_m, "mean_m": finite(lengths.nanmean())}
-            for stick, lengths in zip(found.sticks, found.stick_lengths_m.mT, strict=True)
-        ],
-        "warnings": list(found.warnings),
-    }
+    offsets = zip(found.time_offsets.tolist(), found.time_offsets_std.tolist(), strict=True)
+    return without_nan(
+        {
+            "world": dataclasses.asdict(found.world),
+            "cameras": [
+                {
+                    "name": name,
+                    "reprojection_median_px": median,
+                    "keypoints": used,
+                    "time_offset_s": offset,
+                    "time_offset_std_s": std,
+                }
+                for name, median, used, (offset, std) in zip(
+                    found.camera_names, found.reprojection_median_px.tolist(), _used(found), offsets, strict=True
+                )
+            ],
+            "points": [
+                {"name": name, "frames": frames, "std_m": std, "sigma_px": sigma}
+                for name, frames, std, sigma in zip(
+                    _names(found),
+                    _frames(found),
+                    found.points_std_m.nanmedian(0).values.tolist(),
+                    found.sigma_px.tolist(),
+                    strict=True,
+                )
+            ],
+            "sticks": [
+                {"start": stick.ends[0], "end": stick.ends[1], "length_m": stick.length_m, "mean_m": float(lengths.nanmean())}
+                for stick, lengths in zip(found.sticks, found.stick_lengths_m.mT, strict=True)
+            ],
+            "warnings": list(found.warnings),
+        }
+    )
 
 
 def _names(found: Reconstruction) -> list[str]:
