@@ -213,6 +213,9 @@ def test_without_intrinsics_those_of_the_start_are_the_start(calibration: Calibr
 def test_an_unusable_start_is_refused_or_not_used(calibration: Calibration):
     session = SPEC.generate()
     rig = Rig.of_calibration(calibration)
+    for function in (lambda: calibrate(session.observations, initial="colmap"), lambda: triangulate(session.observations, "x")):
+        with pytest.raises(CalibrationError, match=r"not a calibration.*got str"):
+            function()
     with pytest.raises(CalibrationError, match="a start without poses"):
         calibrate(session.observations, initial=replace(rig, rotations=None, translations=None))
     together = replace(rig, translations=torch.zeros(4, 3), rotations=rig.rotations)

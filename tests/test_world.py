@@ -176,10 +176,12 @@ def test_the_frame_grows_with_the_body(calibration: Calibration):
     assert torch.allclose(2 * one.translation, two.translation)
 
 
-@pytest.mark.parametrize("missing", ["head", "ankles", "names"])
+@pytest.mark.parametrize("missing", ["head", "ankles", "names", "extent"])
 def test_without_a_standing_body_the_frame_is_refused(calibration: Calibration, missing: str):
-    gone = {"head": ("head", "head_top"), "ankles": ("left_ankle",), "names": ()}[missing]
+    gone = {"head": ("head", "head_top"), "ankles": ("left_ankle",)}.get(missing, ())
     points = calibration.points.clone()
+    if missing == "extent":
+        points[:] = points[:1, :1]
     names = calibration.point_names if missing != "names" else None
     for name in gone:
         points[:, calibration.point_names.index(name)] = torch.nan
@@ -187,6 +189,20 @@ def test_without_a_standing_body_the_frame_is_refused(calibration: Calibration, 
     for world in ("athlete", "floor"):
         with pytest.raises(CalibrationError, match="no standing body"):
             without.in_world(world)
+
+
+@pytest.mark.parametrize("gone", [["left_shoulder"], ["pelvis"], ["left_shoulder", "right_shoulder", "pelvis"], ["spine"]])
+def test_the_vertical_survives_points_that_are_never_known(calibration: Calibration, gone: list[str]):
+    points = calibration.points.clone()
+    points[:, [calibration.point_names.index(name) for name in gone]] = torch.nan
+    moved, whole = replace(calibration, points=points).in_world("athlete"), calibration.in_world("athlete")
+    assert error_deg(moved.rotations[0].mT @ whole.rotations[0][:, 2], torch.tensor([0, 0, 1.0]).double()) < 2.0
+
+
+def test_one_frame_is_enough(calibration: Calibration):
+    points = calibration.points.clone()
+    points[1:] = torch.nan
+    assert replace(calibration, points=points).in_world("athlete").rotations.isfinite().all()
 
 
 # --- what is known of the scene ----------------------------------------------------------------------------------------------

@@ -25,6 +25,26 @@ CONTRADICTED_START = (
 _LEAST_DISTANCE = 1e-9
 
 
+def cameras_of(calibration: Calibration | Rig, where: str) -> Rig:
+    """The cameras of a calibration.
+
+    Args:
+        calibration: which.
+        where: the argument, for the message.
+
+    Raises:
+        CalibrationError: if it is none.
+    """
+    from torchstickcal.io.rig import Rig
+
+    if isinstance(calibration, Calibration):
+        return Rig.of_calibration(calibration)
+    if not isinstance(calibration, Rig):
+        expected = "a Calibration, or a Rig from torchstickcal.io.read_calibration"
+        raise CalibrationError("not a calibration", where=where, got=type(calibration).__name__, expected=expected)
+    return calibration
+
+
 def starting_from(initial: Calibration | Rig, observations: Observations) -> tuple[Observations, Poses]:
     """A session and poses of its cameras to start from, in the frame of the first camera and with distances of about 1.
 
@@ -34,9 +54,8 @@ def starting_from(initial: Calibration | Rig, observations: Observations) -> tup
         CalibrationError: if there are no poses, or not of every camera.
     """
     from torchstickcal.io.lenses import arranged, lenses_of
-    from torchstickcal.io.rig import Rig
 
-    rig = initial if isinstance(initial, Rig) else Rig.of_calibration(initial)
+    rig = cameras_of(initial, "initial")
     size, device = observations.image_size, observations.keypoints.device
     images = None if size is None else size.double().cpu().expand(observations.num_cameras, 2)
     known = observations.intrinsics_known

@@ -21,6 +21,7 @@ from torchstickcal.pipeline.initialise import triangulated
 from torchstickcal.pipeline.relabel import Labels
 from torchstickcal.pipeline.run import Run
 from torchstickcal.pipeline.stage import run_stage
+from torchstickcal.pipeline.start import cameras_of
 from torchstickcal.pipeline.synchronise import on_common_frames, search_offsets, unsynchronised
 from torchstickcal.pipeline.warnings import keypoint_warnings
 from torchstickcal.reconstruction import Reconstruction
@@ -81,9 +82,8 @@ def triangulate(
         (torch.Size([20, 21, 3]), 'athlete')
     """
     from torchstickcal.io.lenses import arranged, lenses_of, matched
-    from torchstickcal.io.rig import Rig
 
-    rig = calibration if isinstance(calibration, Rig) else Rig.of_calibration(calibration)
+    rig = cameras_of(calibration, "calibration")
     size, count = observations.image_size, observations.num_cameras
     images = None if size is None else size.double().cpu().expand(count, 2)
     covariance = _covariance(calibration, matched(rig.names, observations.camera_names)[0])

@@ -26,6 +26,8 @@ _LIFTED, _LIFTED_SCALE = 0.12, 0.02
 """Difference of height from which a foot carries less than the other: more than an error of the vertical explains."""
 _STEP, _MOVED = 3, 0.02
 """Frames before and after in which a foot that carries moves less than so many of these heights."""
+_BALANCE_DEG, _LEAN_DEG = 2.5, 8.0
+"""How far from the vertical the mean lines from the feet to the centre of mass and to the head are, with a swing's lean."""
 _UPRIGHT = 0.9
 """Quantile of the distances of the head from the ankles that is that height."""
 
@@ -43,7 +45,9 @@ class Body:
     both_ankles: Tensor
     """(2, G, 3), left and right"""
     mass: Tensor
-    """(G, 3), the centre of mass"""
+    """(G, 3), the centre of mass, or the head where too little of the body is known"""
+    balance_deg: float
+    """how far from the vertical the mean line from the feet to it is"""
     left: Tensor
     """(G, 3), from right to left"""
     feet: tuple[tuple[float, Tensor], ...]
@@ -70,15 +74,16 @@ class Body:
 
         head = next((track[name] for name in _HEAD if name in track), None)
         ankles = middle("ankle")
-        if head is None or ankles is None or not bool((head - ankles).isfinite().any()):
+        apart = torch.zeros(0) if head is None or ankles is None else (head - ankles).norm(dim=-1)
+        apart = apart[apart.isfinite() & (apart > 0)]
+        if head is None or ankles is None or not len(apart):
             raise CalibrationError(
                 "no standing body",
                 where="world",
-                got="no head" if head is None else "no ankles" if ankles is None else "no frame with head and ankles",
+                got="no head" if head is None else "no ankles" if ankles is None else "no frame with a head above ankles",
                 expected="points called head_top, head or nose, and left_ankle and right_ankle, known in the same frames",
             )
-        known = (head - ankles).norm(dim=-1)
-        height_m = float(known[known.isfinite()].quantile(_UPRIGHT))
+        height_m = float(apart.quantile(_UPRIGHT))
         track, head, ankles = (
             {name: positions / height_m for name, positions in track.items()},
             head / height_m,
@@ -93,7 +98,7 @@ class Body:
                 del needed[arm]
         masses = torch.stack([_MASS[name] * joint for name, joint in needed.items()]).sum(0)
         mass = masses / sum(map(_MASS.__getitem__, needed))
-        whole = {"head", "shoulder", "hip", "ankle"} <= set(needed)
+        whole = {"head", "shoulder", "hip", "ankle"} <= set(needed) and bool(mass.isfinite().any())
         both = torch.stack([track.get(f"{side}_ankle", ankles) for side in ("left", "right")])
         feet = tuple(
             (height, track[f"{side}_{point}"])
@@ -101,7 +106,7 @@ class Body:
             for side in ("left", "right")
             if f"{side}_{point}" in track
         )
-        return Body(height_m, head, ankles, both, mass if whole else head, left, feet)
+        return Body(height_m, head, ankles, both, *((mass, _BALANCE_DEG) if whole else (head, _LEAN_DEG)), left, feet)
 
     def balance(self, up: Tensor) -> Tensor:
         """From the ground below the feet to the centre of mass (G, 3); a foot that is lifted carries less.
@@ -116,7 +121,7 @@ class Body:
         carried = carried / carried.sum(0)
         forward = torch.linalg.cross(self.left, up.expand_as(self.left))
         toes = _ANKLE_TO_MIDDLE * forward / forward.norm(dim=-1, keepdim=True)
-        return self.mass - (carried[..., None] * self.both_ankles).sum(0) - toes
+        return self.mass - (carried[..., None] * self.both_ankles).sum(0) - toes.nan_to_num()
 
 
 def moved_around(track: Tensor) -> Tensor:

@@ -15,8 +15,6 @@ from torch import Tensor
 
 from torchstickcal.world.body import Body, moved_around
 
-_BALANCE_DEG = 2.5
-"""How far from the vertical a body's mean line of balance is."""
 _CAMERA_DEG, _CAMERA_CASES = 1.3, 3
 """How far from upright cameras are before they are compared, and as many cameras as this counts for."""
 _STEEP = 0.8
@@ -57,7 +55,7 @@ def upright(body: Body, rotations: Tensor) -> Upright:
         rotations: (C, 3, 3), world to camera.
     """
     first = _unit(torch.nanmedian(_directions(body.head - body.ankles), dim=0).values)
-    up, std_deg = first, _BALANCE_DEG
+    up, std_deg = first, body.balance_deg
     for _ in range(_ROUNDS):
         along = _across(up)
         systems = [_balance(body, up, along), _cameras(rotations, up, along), _footholds(body, up, along)]
@@ -76,7 +74,7 @@ def _balance(body: Body, up: Tensor, along: Tensor) -> tuple[Tensor, Tensor]:
     """Information (2, 2) and its product with the step (2,) that the balance of the body asks for."""
     balance = body.balance(up)
     mean = _unit(_directions(balance[balance.isfinite().all(-1)]).mean(0))
-    precision = 1 / math.radians(_BALANCE_DEG) ** 2
+    precision = 1 / math.radians(body.balance_deg) ** 2
     return precision * torch.eye(2, dtype=torch.float64), precision * along @ (mean - up)
 
 
