@@ -26,7 +26,7 @@ FLOORS = [
     ["solvers.base"],
     ["solvers.elimination"],
     ["solvers"],
-    ["metrics"],
+    ["metrics", "bridges"],
     ["world"],
     ["result", "reconstruction"],
     ["io"],

@@ -53,7 +53,7 @@ _HOMES = {
     "load_config": "config",
     "triangulate": "pipeline.triangulate",
 }
-_SUBPACKAGES = {"io", "losses", "metrics", "simulate"}
+_SUBPACKAGES = {"bridges", "io", "losses", "metrics", "simulate"}
 
 __all__ = [
     "Calibration",

@@ -338,7 +338,7 @@ class Calibration:
             "fps": self.fps,
             "point_names": self.point_names,
             "camera_names": self.camera_names,
-            "stages": [dataclasses.asdict(stage) | {"stop": stage.stop.name} for stage in self.stages],
+            "stages": [_stage_as_plain(stage) for stage in self.stages],
             "seconds": self.seconds,
             "warnings": self.warnings,
             "left_out": self.left_out,
@@ -416,6 +416,13 @@ def _world(about: dict[str, Any]) -> World:
     texts = {name: _checked(about[name], str) for name in ("name", "origin", "axes")}
     optional = {"up": str, "vertical_std_deg": float, "floor_std_m": float}
     return World(**texts, **{name: _checked(about[name], kind | None) for name, kind in optional.items()})
+
+
+def _stage_as_plain(stage: StageRecord) -> dict[str, Any]:
+    """What is saved of a stage: all but the poses at each iteration."""
+    poses = {"rotations", "translations"}
+    iterations = [{name: value for name, value in vars(record).items() if name not in poses} for record in stage.iterations]
+    return {**vars(stage), "stop": stage.stop.name, "iterations": iterations}
 
 
 def _stage_record(stage: dict[str, Any]) -> StageRecord:
