@@ -12,10 +12,10 @@ import torchstickcal
 
 ROOT = Path(__file__).parents[1]
 FLOORS = [
-    ["errors", "workers", "lazy", "precision"],
+    ["errors", "workers", "lazy", "precision", "samples"],
     ["files", "shapes", "arrays"],
     ["untrusted"],
-    ["registry"],
+    ["registry", "skeletons"],
     ["settings"],
     ["geometry"],
     ["losses"],
@@ -26,7 +26,10 @@ FLOORS = [
     ["solvers.base"],
     ["solvers.elimination"],
     ["solvers"],
-    ["result", "metrics", "bridges"],
+    ["metrics", "bridges"],
+    ["world"],
+    ["result", "reconstruction"],
+    ["io"],
     ["pipeline.noise"],
     ["pipeline.run", "pipeline.scale"],
     ["pipeline.stage"],
@@ -40,7 +43,6 @@ FLOORS = [
     ["pipeline"],
     ["layer"],
     ["show"],
-    ["io"],
     ["simulate"],
     ["benchmark.baselines"],
     ["benchmark"],

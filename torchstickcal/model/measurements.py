@@ -160,6 +160,11 @@ class Measurements:
         confidence = self.confidence * kept
         return replace(self, confidence=confidence.mul_((confidence > 0).sum(-2, keepdim=True) >= 2))
 
+    def without_sticks(self) -> Measurements:
+        """The same keypoints, of which no distance is known."""
+        none = {"sticks": self.sticks[:0], "lengths_m": self.lengths_m[:, :0], "stick_sigma_m": self.stick_sigma_m[:0]}
+        return replace(self, **none)
+
     def squared_residuals(self, state: State) -> Tensor:
         """Squared distances (B, C, N) between projections and keypoints, square pixels, times the keypoint's confidence.
 

@@ -220,6 +220,7 @@ def begin(
     refined: Sequence[str] = (),
     offsets_frames: Tensor | None = None,
     start: WarmStart | None = None,
+    poses: tuple[Tensor, Tensor] | None = None,
 ) -> Adjustment:
     """One session with the first estimate of its rig and points.
 
@@ -229,6 +230,8 @@ def begin(
         refined: what is to be estimated of the cameras beside their poses.
         offsets_frames: (C,), time offsets of the cameras' frames, in frames; None for those given.
         start: an earlier estimate; None to estimate the rig from nothing.
+        poses: rotations (C, 3, 3) and translations (C, 3) to start from, up to scale, with the first camera as the world; None
+            to estimate them from nothing.
 
     Raises:
         ConfigError: if nothing sets the scale, if there are camera groups, but not a label for each camera, and if the noise of
@@ -243,6 +246,12 @@ def begin(
     check_noise(config, seen.points_per_frame)
     if start is not None:
         state = _state_of(start, seen, config)
+    elif poses is not None:
+        rotations, translations = poses[0][None].double(), poses[1][None].double()
+        state = State.of(rotations, translations, triangulated(seen, rotations, translations, config.initialise))
+        refined = (
+            refined if observations.intrinsics_known or "focal" in refined else with_refinements(refined, ("focal_shared",))
+        )
     elif observations.intrinsics_known:
         state = initialise(seen, config.initialise, observations.camera_labels)
     else:
@@ -255,7 +264,7 @@ def begin(
     if seen.unknowns.clocked:
         begun = replace(begun, measurements=begun.exposures.unmoved(seen))
     if start is not None and config.relabel:
-        begun = _relabelled(begun, run)
+        begun = relabelled(begun, run)
     if start is not None and seen.unknowns.clocked:
         known = begun.measurements
         if start.inliers is not None:
@@ -300,7 +309,7 @@ def adjust_cameras(adjustment: Adjustment, run: Run, only_last: bool = False) ->
         return _with_last_camera_stage(adjustment, run)
     if not between:
         return _settled(_synchronised(_relabelling([first], adjustment, run), run), run)
-    return _with_last_camera_stage(_through(between[:-1], _relabelling([first], adjustment, run), run), run)
+    return _with_last_camera_stage(through(between[:-1], _relabelling([first], adjustment, run), run), run)
 
 
 def adjust_again(adjustment: Adjustment, run: Run, refined: Sequence[str]) -> Adjustment:
@@ -327,13 +336,13 @@ def adjust_again(adjustment: Adjustment, run: Run, refined: Sequence[str]) -> Ad
         return _settled(_synchronised(replace(again, results=(result,)), run), run)
     begun = replace(again, results=(), records=((),) * seen.sessions)
     *before, _ = run.camera_stages.items()
-    return _with_last_camera_stage(_through(before, begun, run), run)
+    return _with_last_camera_stage(through(before, begun, run), run)
 
 
 def adjust_points(adjustment: Adjustment, run: Run) -> Adjustment:
     """The stages in which the cameras are fixed."""
     for named in run.point_stages.items():
-        before, adjustment = adjustment, _through([named], adjustment, run, roughly=run.to_rounding)
+        before, adjustment = adjustment, through([named], adjustment, run, roughly=run.to_rounding)
         if run.to_rounding:
             adjustment = _finished(adjustment, run, named, before.state, polished)
     return adjustment
@@ -359,7 +368,7 @@ def _with_last_camera_stage(adjustment: Adjustment, run: Run) -> Adjustment:
     """After the last stage that estimates cameras, with clocks and noise that agree with what it found."""
     *_, last = run.camera_stages.items()
     roughly = run.to_rounding and run.settles and not adjustment.asynchronous
-    return _settled(_synchronised(_through([last], adjustment, run, roughly), run), run)
+    return _settled(_synchronised(through([last], adjustment, run, roughly), run), run)
 
 
 def _settled(adjustment: Adjustment, run: Run) -> Adjustment:
@@ -400,7 +409,7 @@ def _finished(
     return replace(adjustment, results=earlier).ended(result).replaced(found, finished)
 
 
-def _through(stages: Iterable[tuple[str, Stage]], adjustment: Adjustment, run: Run, roughly: bool = False) -> Adjustment:
+def through(stages: Iterable[tuple[str, Stage]], adjustment: Adjustment, run: Run, roughly: bool = False) -> Adjustment:
     """After some stages. One in which keypoints count as fewer is repeated, until what they count no longer changes.
 
     Errors that last are hidden in the cameras, as long as points with such errors determine them.
@@ -420,20 +429,20 @@ def _through(stages: Iterable[tuple[str, Stage]], adjustment: Adjustment, run: R
 
 def _relabelling(stages: Sequence[tuple[str, Stage]], begun: Adjustment, run: Run) -> Adjustment:
     """Sessions after their first stages, which are run again where label errors were found, until none are left."""
-    ended = _through(stages, begun, run)
+    ended = through(stages, begun, run)
     for _ in range(_MAX_RELABELLINGS if run.config.relabel else 0):
         before = [ended[session] for session in range(ended.seen.sessions)]
-        after = [_relabelled(session, run) for session in before]
+        after = [relabelled(session, run) for session in before]
         changed = torch.tensor(
             [new is not old for new, old in zip(after, before, strict=True)], device=ended.state.points.device
         )
         if not changed.any():
             break
-        ended = _through(stages, Adjustment.stack(after), run).replaced(~changed, ended)
+        ended = through(stages, Adjustment.stack(after), run).replaced(~changed, ended)
     return ended
 
 
-def _relabelled(adjustment: Adjustment, run: Run) -> Adjustment:
+def relabelled(adjustment: Adjustment, run: Run) -> Adjustment:
     """One session with its label errors undone; the same object where there are none."""
     began = time.perf_counter()
     frames, given = adjustment.frames[0], adjustment.measurements
