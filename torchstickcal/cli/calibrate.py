@@ -39,7 +39,7 @@ def calibrate_session(options: argparse.Namespace) -> int:
         print(f"note: {note}", file=sys.stderr)
     observations = _with_stick(session.observations, options.stick_length, options.stick_sigma)
     check_frame_rate(writers, observations)
-    calibration = calibrate(observations, config, Progress(_monitor(options.tensorboard)), refine, initial)
+    calibration = calibrate(observations, config, Progress(_monitor(options.tensorboard)), refine, initial=initial)
     calibration, sentences = placed(calibration, world)
     for sentence in sentences:
         print(f"note: {sentence}", file=sys.stderr)
