@@ -26,7 +26,7 @@ from torchstickcal.solvers.uncertainty import centre_covariances, point_covarian
 from torchstickcal.stick import Stick
 from torchstickcal.untrusted import open_arrays, reading
 
-_FORMAT = "torchstickcal calibration 7"
+_FORMAT = "torchstickcal calibration 8"
 _TENSORS = {
     "rotations": "C 3 3",
     "translations": "C 3",
@@ -155,6 +155,9 @@ class Calibration:
     """time of the initialisation, of the search for label errors, of each stage and in total"""
     judgement: Quality | Callable[[], Quality] = field(repr=False)
     """the quality, or what gives it when it is first asked for"""
+    left_out: tuple[str, ...] = ()
+    """names of the cameras that share too little with the others, where only the largest part was to be calibrated. They are in
+    no other part of the result."""
 
     @property
     def converged(self) -> bool:
@@ -312,6 +315,7 @@ class Calibration:
             "stages": [dataclasses.asdict(stage) | {"stop": stage.stop.name} for stage in self.stages],
             "seconds": self.seconds,
             "quality": self.quality.as_json(),
+            "left_out": self.left_out,
         }
         with atomic_path(path) as temporary, temporary.open("wb") as file:
             np.savez_compressed(file, meta=np.array(json.dumps(meta)), **arrays)
@@ -345,6 +349,7 @@ class Calibration:
                 stages=tuple(_stage_record(stage) for stage in _checked(meta["stages"], list)),
                 seconds=_numbers(meta["seconds"]),
                 judgement=Quality.from_json(_checked(meta["quality"], dict)),
+                left_out=_texts(meta["left_out"]),
             )
             counts = {"C": calibration.camera_names, "P": calibration.point_names, "S": calibration.sticks}
             if any(given is not None and len(given) != sizes[axis] for axis, given in counts.items()):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from functools import partial
 
 import torch
@@ -21,7 +20,12 @@ from torchstickcal.solvers.uncertainty import camera_covariance, likelihood, rul
 
 
 def conclude(
-    ended: Adjustment, check: CameraCheck, clocks: ClockEstimate | None, unsynchronised: bool, run: Run
+    ended: Adjustment,
+    check: CameraCheck,
+    clocks: ClockEstimate | None,
+    unsynchronised: bool,
+    left_out: tuple[str, ...],
+    run: Run,
 ) -> Calibration:
     """The calibration of one session.
 
@@ -30,6 +34,7 @@ def conclude(
         check: what the keypoints say of lenses and clocks.
         clocks: what a search for time offsets has found; None without one.
         unsynchronised: whether the motion contradicts the clocks, which were not estimated.
+        left_out: names of the cameras that are no part of the rig.
         run: its configuration, and the time by step.
     """
     observations, frames, measurements = ended.observations[0], ended.frames[0], ended.measurements
@@ -72,7 +77,8 @@ def conclude(
         camera_names=observations.camera_labels,
         stages=ended.records[0],
         seconds=dict(run.seconds),
-        judgement=partial(judged, Evidence(ended, unknowns, noise, ruler, clocks, unsynchronised, run.config)),
+        judgement=partial(judged, Evidence(ended, unknowns, noise, ruler, clocks, unsynchronised, left_out, run.config)),
+        left_out=left_out,
     )
 
 

@@ -35,6 +35,7 @@ class Evidence:
         ruler: the covariance that the errors of the sticks' given lengths add.
         clocks: what a search for time offsets has found; None without one.
         unsynchronised: whether the motion contradicts the clocks, which were not estimated.
+        left_out: names of the cameras that are no part of the rig.
         config: the configuration.
     """
 
@@ -44,6 +45,7 @@ class Evidence:
     ruler: Tensor
     clocks: ClockEstimate | None
     unsynchronised: bool
+    left_out: tuple[str, ...]
     config: Config
 
     @property

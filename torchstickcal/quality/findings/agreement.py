@@ -26,6 +26,13 @@ _IMPRECISE_RIG_SHARE, _LOST_RIG_SHARE = 0.02, 0.1
 @findings("agreement", "cameras that contradict the others, that see one view, or of which little is known")
 def agreement(evidence: Evidence) -> Iterator[Finding]:
     """Findings about single cameras and pairs of them."""
+    if evidence.left_out:
+        yield Finding(
+            "cameras_left_out",
+            Severity.CAUTION,
+            "Not calibrated, because they share too few points with the other cameras: " + ", ".join(evidence.left_out) + ".",
+            cameras=evidence.left_out,
+        )
     yield from _stops(evidence)
     yield from _shares(evidence)
     yield from _same_views(evidence)
