@@ -13,6 +13,7 @@ from torchstickcal.geometry import se3
 from torchstickcal.lazy import cached_property
 from torchstickcal.model.measurements import Measurements
 from torchstickcal.model.state import State
+from torchstickcal.model.unknowns import all_unknowns
 from torchstickcal.observations import Observations
 from torchstickcal.pipeline.adjust import Adjustment
 from torchstickcal.pipeline.synchronise import ClockEstimate
@@ -22,6 +23,12 @@ from torchstickcal.quality.moved import Motion, motion_of
 from torchstickcal.quality.verdict import Acceptance
 from torchstickcal.result import CameraParameter
 from torchstickcal.solvers.uncertainty import centre_covariances, relative_scale_std
+
+_CONSISTENT_SHARE, _BEHIND_OTHERS, _NOISY_MRAD = 0.62, 0.85, 10.0
+"""Least share of a camera's keypoints that agree, also over that of the median camera, and noise of the keypoints, of a rig whose
+cameras see one scene. Sound cameras keep 84 % and more, with 20 % of wrong keypoints 66 %."""
+_OTHER_PERSON_SHARE = 0.2
+"""Share of a camera's frames that were set aside as those of another person, from which on the camera itself is doubted."""
 
 
 @dataclass(frozen=True)
@@ -97,6 +104,14 @@ class Evidence:
         return (kept / seen.clamp_min(1)).where(seen > 0, 1.0)
 
     @cached_property
+    def consistent(self) -> bool:
+        """Whether all cameras agree with each other as those of one scene do, so that small errors can be told by linearising."""
+        least, median = float(self.agreement.min()), float(self.agreement.median())
+        agree = least > max(_CONSISTENT_SHARE, _BEHIND_OTHERS * median)
+        person = float(self.ended.labels.other_person[0].double().mean(1).max()) < _OTHER_PERSON_SHARE
+        return self.ended.converged and agree and person and self.noise_mrad < _NOISY_MRAD
+
+    @cached_property
     def centres(self) -> Tensor:
         """(C, 3), the cameras' centres, metres."""
         return se3.camera_centres(self.state.rotations[0], self.state.translations[0])
@@ -139,6 +154,29 @@ class Evidence:
             return None
         pulls = FramePulls.of(self.measurements, self.state, self.ended.last.sigma_px)
         return motion_of(pulls, self.state.rotations[0], self.state.translations[0])
+
+    @cached_property
+    def contradictions(self) -> dict[str, Tensor]:
+        """(C,), by the name of what may be unknown of the cameras: squared length, in standard deviations, of the difference
+        between what the keypoints suggest and what was given; 0 where it was estimated or is not known."""
+        found: dict[str, Tensor] = {}
+        for name, parameter in self.unknowns.items():
+            difference = (parameter.by_component("suggested") - parameter.by_component("given")).double()
+            squared = (difference / parameter.by_component("suggested_std").double()).square().sum(1)
+            found[name] = squared.nan_to_num(0.0, 0.0, 0.0) * (not parameter.refined)
+        return found
+
+    def explains_most(self, name: str) -> bool:
+        """Whether a cause explains more of the residuals than any other that is small enough to be told by linearising.
+
+        Args:
+            name: ``motion``, or a family of unknowns: ``lens`` or ``clock``.
+        """
+        strengths = {"motion": 0.0 if self.motion is None else self.motion.evidence, "lens": 0.0, "clock": 0.0}
+        for unknown, squared in self.contradictions.items():
+            family = all_unknowns()[unknown].family
+            strengths[family] = max(strengths.get(family, 0.0), float(squared.max()))
+        return self.consistent and strengths[name] >= max(strengths.values())
 
     @cached_property
     def acceptance(self) -> Acceptance | None:

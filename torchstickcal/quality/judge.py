@@ -17,6 +17,6 @@ def judged(evidence: Evidence) -> Quality:
 def _judged(evidence: Evidence) -> Quality:
     found = [finding for family in FAMILIES.values() if not family.tries for finding in family.look(evidence)]
     wrong = any(finding.severity >= Severity.SERIOUS for finding in found)
-    if wrong and not any(finding.is_cause for finding in found):
+    if wrong and not (evidence.consistent and any(finding.is_cause for finding in found)):
         found += [finding for family in FAMILIES.values() if family.tries for finding in family.look(evidence)]
     return Quality.of(found, evidence.acceptance)

@@ -19,7 +19,7 @@ from torchstickcal.quality.linear import FramePulls
 LEAST_EVIDENCE = 45.0
 """Squared length of the change in its standard deviations, from which on a camera is said to have moved: 6 numbers are fitted
 at the best of many frames and cameras. Measured on sound sessions, see docs/quality.md."""
-_PRIOR_M, _PRIOR_RAD = 0.3, 0.1
+_PRIOR_M, _PRIOR_RAD = 0.03, 0.02
 """A change is expected to be smaller than this; it keeps the test finite where a direction is not determined."""
 _LEAST_FRAMES = 12
 _EDGE = 0.04
@@ -91,9 +91,7 @@ class _Change(NamedTuple):
     gradual: bool
 
 
-def _changes(
-    camera: int, gradient: Tensor, information: Tensor, inverse: Tensor, prior: Tensor, steps: Tensor
-) -> _Change:
+def _changes(camera: int, gradient: Tensor, information: Tensor, inverse: Tensor, prior: Tensor, steps: Tensor) -> _Change:
     """The best change of one camera: at once, before one of some parts, or gradually over the session."""
     place = slice(6 * camera, 6 * camera + 6)
     pull, rows = gradient[:, camera], information[:, place]

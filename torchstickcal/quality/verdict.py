@@ -111,8 +111,13 @@ class Quality:
 
     @staticmethod
     def of(findings: Iterable[Finding], acceptance: Acceptance | None = None) -> Quality:
-        """The findings in their order: the most severe first, and among them causes first."""
-        return Quality(tuple(sorted(findings, key=lambda finding: (-finding.severity, not finding.is_cause))), acceptance)
+        """The findings in their order: causes of what is serious first, then the most severe."""
+
+        def place(finding: Finding) -> tuple[bool, int, bool]:
+            explains = finding.is_cause and finding.severity >= Severity.SERIOUS
+            return not explains, -finding.severity, not finding.is_cause
+
+        return Quality(tuple(sorted(findings, key=place)), acceptance)
 
     @property
     def verdict(self) -> Verdict:

@@ -93,31 +93,33 @@ def _same_views(evidence: Evidence) -> Iterator[Finding]:
     """Pairs of cameras that see the points from the same place, and rigs that have no baseline at all."""
     measurements = evidence.measurements
     rays = torch.nn.functional.normalize(evidence.state.points - evidence.centres[..., None], dim=1)
-    largest = 0.0
+    angles: dict[tuple[int, int], float] = {}
     for first, second in itertools.combinations(range(evidence.cameras), 2):
         common = measurements.visible[0, first] & measurements.visible[0, second]
-        angles = (rays[first] - rays[second])[:, common].square().sum(0).sqrt()
-        mean = float(angles.mean()) if len(angles) else torch.nan
-        largest = max(largest, min(mean, torch.pi - mean)) if mean == mean else largest
-        if mean < _SAME_VIEW_RAD:
-            names = (evidence.camera(first), evidence.camera(second))
-            yield Finding(
-                "same_view",
-                Severity.SERIOUS if evidence.cameras > 2 else Severity.FATAL,
-                f"{names[0]} and {names[1]} see the scene from the same place, so that the pair has no depth.",
-                "Check whether the same video was taken for both.",
-                cameras=names,
-                figure=1000 * mean,
-                limit=1000 * _SAME_VIEW_RAD,
-                unit="mrad",
-                is_cause=True,
-            )
-    if torch.pi / 180 * _LEAST_PARALLAX_DEG > largest > _SAME_VIEW_RAD:
+        if bool(common.any()):
+            apart = (rays[first] - rays[second])[:, common].square().sum(0).sqrt()
+            angles[first, second] = float(apart.mean())
+    same = {pair: angle for pair, angle in angles.items() if angle < _SAME_VIEW_RAD}
+    for (first, second), angle in same.items():
+        names = (evidence.camera(first), evidence.camera(second))
+        yield Finding(
+            "same_view",
+            Severity.SERIOUS if evidence.cameras > 2 else Severity.FATAL,
+            f"{names[0]} and {names[1]} see the scene from the same place, so that the pair has no depth.",
+            "Check whether the same video was taken for both.",
+            cameras=names,
+            figure=1000 * angle,
+            limit=1000 * _SAME_VIEW_RAD,
+            unit="mrad",
+            is_cause=True,
+        )
+    largest = max((min(angle, torch.pi - angle) for angle in angles.values()), default=torch.inf)
+    if evidence.cameras > 2 and largest < torch.pi / 180 * _LEAST_PARALLAX_DEG:
         yield Finding(
             "no_baseline",
-            Severity.SERIOUS,
-            f"All cameras see the scene from nearly the same place: their rays meet at {largest * 180 / torch.pi:.2g} degrees at "
-            "most, so that depth is hardly known.",
+            Severity.FATAL if largest < _SAME_VIEW_RAD else Severity.SERIOUS,
+            "All cameras see the scene from nearly the same place: their rays meet at "
+            f"{largest * 180 / torch.pi:.2g} degrees at most, so that depth is hardly known.",
             "Move the cameras apart.",
             figure=largest * 180 / torch.pi,
             limit=_LEAST_PARALLAX_DEG,

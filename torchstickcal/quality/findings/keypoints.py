@@ -75,7 +75,7 @@ def _labels(evidence: Evidence) -> Iterator[Finding]:
         if count:
             yield Finding(
                 "other_person",
-                Severity.CAUTION if count > _OTHER_PERSON_SHARE * frames else Severity.NOTE,
+                Severity.SERIOUS if count > _OTHER_PERSON_SHARE * frames else Severity.NOTE,
                 f"{evidence.camera(camera)}: {count} of {frames} frames were not used: all their keypoints contradict the other "
                 "cameras, as if they showed another person.",
                 "Check which person the detector follows in this camera." if count > _OTHER_PERSON_SHARE * frames else "",

@@ -9,7 +9,7 @@ from torchstickcal.quality.finding import Finding, Severity
 from torchstickcal.quality.moved import LEAST_EVIDENCE
 from torchstickcal.quality.registry import findings
 
-_HARMLESS_DEG, _HARMLESS_SHARE = 0.3, 0.005
+_HARMLESS_DEG, _HARMLESS_SHARE = 0.2, 0.002
 """A change that is smaller than this angle, and this share of the rig, makes the cameras wrong by less than 1 %."""
 _RIVAL_SHARE = 0.7
 """Evidence against another camera, as a share, from which on it is not certain which of both moved."""
@@ -17,9 +17,9 @@ _RIVAL_SHARE = 0.7
 
 @findings("motion", "cameras that moved during the session")
 def motion(evidence: Evidence) -> Iterator[Finding]:
-    """The camera that moved, when and how far."""
+    """The camera that moved, when and how far. A lens or a clock that is wrong looks alike, and explains more where it is."""
     found = evidence.motion
-    if found is None or found.evidence < LEAST_EVIDENCE:
+    if found is None or found.evidence < LEAST_EVIDENCE or not evidence.explains_most("motion"):
         return
     name = evidence.camera(found.camera)
     harmless = found.rotation_deg < _HARMLESS_DEG and found.shift_m < _HARMLESS_SHARE * evidence.rig_m

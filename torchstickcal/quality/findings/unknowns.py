@@ -11,6 +11,8 @@ from torchstickcal.quality.registry import findings
 from torchstickcal.result import CameraParameter
 
 _CONTRADICTED_SIGMAS = 4.0
+_CLEAR_SIGMAS = 8.0
+"""For values with a weak prior, which biased keypoints move easily."""
 _OPEN_SHARE = 0.5
 _WRONG_FOCAL = 0.01
 """Error of a focal length from which on the camera's distance is wrong by more than 1 %."""
@@ -23,14 +25,15 @@ def unknowns(evidence: Evidence) -> Iterator[Finding]:
     """Findings about lenses and clocks."""
     for name, unknown in all_unknowns().items():
         yield from _contradicted(evidence, unknown, evidence.unknowns[name])
+        yield from _different(evidence, unknown, evidence.unknowns[name])
         yield from _undetermined(evidence, unknown, evidence.unknowns[name])
-    if evidence.unsynchronised:
+    if evidence.unsynchronised and not _in_step(evidence):
         yield Finding(
             "unsynchronised",
             Severity.SERIOUS,
             "The cameras do not seem to be synchronised: other frames fit together better than those of equal number or time.",
             "Estimate the time offsets (refine 'time_offset').",
-            is_cause=True,
+            is_cause=evidence.explains_most("clock"),
         )
     for camera, reason in enumerate(evidence.clocks.reasons if evidence.clocks is not None else ()):
         if reason:
@@ -38,6 +41,15 @@ def unknowns(evidence: Evidence) -> Iterator[Finding]:
             yield Finding(
                 "time_offset_uncertain", Severity.CAUTION, f"{name}: its time offset is uncertain, {reason}.", cameras=(name,)
             )
+
+
+def _in_step(evidence: Evidence) -> bool:
+    """Whether the points say that the cameras are synchronised, to a fraction of a frame."""
+    rate, offset = evidence.ended.frames[0].rate_hz, evidence.unknowns["time_offset"]
+    if rate is None or not evidence.consistent:
+        return False
+    known = offset.suggested_std * rate < _WRONG_FRAMES / 2
+    return bool((known & ((offset.suggested - offset.given).abs() * rate < _WRONG_FRAMES)).all())
 
 
 def _contradicted(evidence: Evidence, unknown: CameraUnknown, parameter: CameraParameter) -> Iterator[Finding]:
@@ -67,6 +79,34 @@ def _contradicted(evidence: Evidence, unknown: CameraUnknown, parameter: CameraP
             figure=(value - given) / std if std > 0 else None,
             limit=_CONTRADICTED_SIGMAS,
             unit="standard deviations",
+            is_cause=matters and evidence.explains_most(unknown.family),
+        )
+
+
+def _different(evidence: Evidence, unknown: CameraUnknown, parameter: CameraParameter) -> Iterator[Finding]:
+    """Given values that small errors of the keypoints change much, where the keypoints clearly want others."""
+    guessed = unknown.family == "lens" and not evidence.observations.intrinsics_known
+    if unknown.noticeable_prior_share is not None or unknown.family != "lens" or parameter.refined or guessed:
+        return
+    difference = (parameter.by_component("suggested") - parameter.by_component("given")).abs()
+    far = (difference > parameter.by_component("prior_std")).any(1)
+    for camera in (far & (evidence.contradictions[unknown.name] > _CLEAR_SIGMAS**2)).nonzero().flatten().tolist():
+        name = evidence.camera(camera)
+        pairs = zip(parameter.by_component("suggested")[camera].tolist(), parameter.by_component("given")[camera].tolist(), strict=True)
+        values = ", ".join(
+            f"{component} {_quantity(value, None, unknown.unit)} instead of {_quantity(given, None, unknown.unit)}"
+            for component, (value, given) in zip(unknown.components, pairs, strict=True)
+        )
+        yield Finding(
+            f"{unknown.name}_contradicted",
+            Severity.CAUTION,
+            f"{name}: the keypoints suggest another {unknown.label}: {values}.",
+            f"Check it, or estimate it (refine {next(iter(unknown.variants))!r}).",
+            cameras=(name,),
+            figure=float(evidence.contradictions[unknown.name][camera].sqrt()),
+            limit=_CLEAR_SIGMAS,
+            unit="standard deviations",
+            is_cause=evidence.explains_most("lens"),
         )
 
 
