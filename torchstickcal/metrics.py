@@ -23,6 +23,8 @@ class PoseErrors:
     """(..., C)"""
     translation_m: Tensor
     """(..., C), distance of the camera centres"""
+    aligned_by: str = "camera centres"
+    """what was laid onto the truth before the comparison, by a rotation and a translation without scale"""
 
     @property
     def mean_rotation_deg(self) -> float:
@@ -66,11 +68,14 @@ def pose_errors(rotations: Any, translations: Any, true_rotations: Any, true_tra
     if spread[1] <= _COLLINEAR * spread[0]:
         rotation = r_true[0].mT @ r[..., 0, :, :]
         offset = true_centres[0] - (rotation @ centres[..., 0, :, None])[..., 0]
+        aligned_by = "pose of the first camera, rotation and translation, no scale (the camera centres lie on one line)"
     else:
         rotation, offset = align(centres, true_centres)
+        aligned_by = f"all {cameras} camera centres, rotation and translation, no scale"
     return PoseErrors(
         rotation_deg=rotation_angle(r_true @ rotation[..., None, :, :] @ r.mT).rad2deg(),
         translation_m=(centres @ rotation.mT + offset[..., None, :] - true_centres).norm(dim=-1),
+        aligned_by=aligned_by,
     )
 
 

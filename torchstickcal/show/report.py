@@ -8,6 +8,7 @@ from typing import Any
 from torch import Tensor
 
 from torchstickcal.model.unknowns import all_unknowns
+from torchstickcal.quality.finding import Severity
 from torchstickcal.result import Calibration, CameraParameter
 
 
@@ -40,7 +41,7 @@ def table(calibration: Calibration) -> str:
         if known and (parameter.refined or all_unknowns()[name].noticeable_prior_share is not None):
             text += [_aligned(_parameter_rows(calibration, parameter)), ""]
     if calibration.sticks:
-        rows = [["stick", "given (m)", "mean (m)", "spread (mm)", "frames"]]
+        rows = [["stick, fitted", "given (m)", "mean (m)", "spread (mm)", "frames"]]
         for stick, lengths in zip(calibration.sticks, calibration.stick_lengths_m.mT, strict=True):
             known = lengths[lengths.isfinite()]
             spread = f"{1000 * float(known.std()):.2f}" if len(known) > 1 else "-"
@@ -55,13 +56,15 @@ def table(calibration: Calibration) -> str:
         rows.append([stage.name, str(last.iteration), f"{last.cost:.6g}", f"{1000 * stage.seconds:.1f}", str(stage.stop)])
     rows.append(["total", "", "", f"{1000 * calibration.seconds['total']:.1f}", ""])
     text.append(_aligned(rows))
-    text += ["", *(f"warning: {warning}" for warning in calibration.warnings)] if calibration.warnings else []
+    notes = [finding for finding in calibration.quality.findings if finding.severity == Severity.NOTE]
+    text += ["", *(f"note: {finding.text}" for finding in notes)] if notes else []
     return "\n".join(text)
 
 
 def summary(calibration: Calibration) -> dict[str, Any]:
     """The calibration without its arrays, as JSON can hold it."""
     return {
+        "quality": calibration.quality.as_json(),
         "status": calibration.status,
         "converged": calibration.converged,
         "cameras": [
