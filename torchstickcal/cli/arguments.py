@@ -240,6 +240,6 @@ def _add_plugin(command: argparse.ArgumentParser) -> None:
         metavar="MODULE|FILE.py",
         action="append",
         default=[],
-        help="a Python module of yours that registers losses, camera unknowns, findings, file formats, sports or baselines; may be given "
-        "several times. It is a program that is run with your rights: use only what you trust",
+        help="a Python module of yours that registers losses, camera unknowns, findings, file formats, sports or baselines; "
+        "may be given several times. It is a program that is run with your rights: use only what you trust",
     )

@@ -68,7 +68,7 @@ def check(calibration: Calibration | OldRig, observations: Observations) -> Qual
 
     Args:
         calibration: the old one.
-        observations: the new recording, with keypoints of the same cameras at the same time. Sticks are compared if there are any.
+        observations: the new recording, with keypoints of the same cameras at the same time. Sticks are compared too.
 
     Returns:
         The verdict: good where no camera moved, else with a finding for each camera that did: how far, and since when.
@@ -137,7 +137,8 @@ class _Rig:
         pull, own = self.pulls.gradient[:, camera].sum(0), self.pulls.information[:, place, place].sum(0)
         prior = pull.new_tensor([1 / _PRIOR_M**2] * 3 + [1 / _PRIOR_RAD**2] * 3).diag()
         change = torch.linalg.solve(own + prior, pull)
-        scatter = _lasting(self.pulls.gradient_by_part[:, camera], self.pulls.information[:, place, place])
+        parts = self.pulls.information[:, place, place]
+        scatter = _lasting(self.pulls.gradient_by_part[:, camera] - parts @ change, parts)
         covariance = scatter * torch.linalg.inv(own + prior)
         if not exact:
             covariance = covariance + self.old.variance_of(camera).to(pull)
@@ -192,8 +193,8 @@ def _checked(old: OldRig, observations: Observations) -> Quality:
                 "camera_contradicts",
                 Severity.FATAL,
                 f"{name}: only {share:.0%} of its keypoints agree with the calibration, wherever it is.",
-                "Check that the recording is of the same cameras in the same order, and that all show the same athlete at the same "
-                "time.",
+                "Check that the recording is of the same cameras in the same order, and that all show the same athlete at the "
+                "same time.",
                 cameras=(name,),
                 figure=share,
                 limit=_LEAST_AGREEING,
@@ -259,7 +260,7 @@ def _lasting(pull: Tensor, own: Tensor) -> float:
     """Variance of the sum of pulls (K, 6), over that of independent keypoints, at least 1."""
     mean = own.mean(0)
     root = torch.linalg.cholesky(mean + 1e-9 * mean.diagonal().mean().clamp_min(1e-300) * torch.eye(6).to(mean))
-    white = torch.linalg.solve_triangular(root, (pull - pull.mean(0)).mT, upper=False).mT
+    white = torch.linalg.solve_triangular(root, pull.mT, upper=False).mT
     found = [1.0]
     for blocks in (12, 24, len(white)):
         length = max(1, len(white) // blocks)

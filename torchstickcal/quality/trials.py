@@ -62,7 +62,8 @@ def hypotheses() -> Iterator[Hypothesis]:
     )
     yield Hypothesis(
         "intrinsics_turned",
-        "its intrinsics are those of a video turned by 90 degrees: with the coordinates of the centre exchanged its keypoints agree",
+        "its intrinsics are those of a video turned by 90 degrees: with the coordinates of the centre exchanged its keypoints "
+        "agree",
         "Give the intrinsics of the video as the detector saw it.",
         _turned,
     )

@@ -45,7 +45,7 @@ class LengthErrors:
     frames: int
     """number of lengths"""
     wrong: int
-    """number of them that are wrong, by more than 6 of their standard deviations: they are in ``inside``, but not in the errors"""
+    """number of them that are wrong, by more than 6 standard deviations: they are in ``inside``, but not in the errors"""
     largest_m: float
     """the error of largest absolute value"""
     mean_m: float

@@ -65,7 +65,8 @@ def _scale(evidence: Evidence) -> Iterator[Finding]:
             yield Finding(
                 "scale_from_few_frames",
                 Severity.CAUTION,
-                f"The scale comes from {frames} of {kept.frames} frames: in the others no two cameras see both ends of a stick.",
+                f"The scale comes from {frames} of {kept.frames} frames: in the others no two cameras see both ends "
+                "of a stick.",
                 "Check the keypoints of the stick's ends, and lower the detector's threshold for them.",
                 figure=frames,
                 limit=_FEW_FRAMES,

@@ -30,6 +30,11 @@ def unknowns(evidence: Evidence) -> Iterator[Finding]:
         yield from _contradicted(evidence, unknown, evidence.unknowns[name])
         yield from _different(evidence, unknown, evidence.unknowns[name])
         yield from _undetermined(evidence, unknown, evidence.unknowns[name])
+
+
+@findings("clocks", "cameras whose clocks are apart or uncertain, by the motion in the images")
+def clocks(evidence: Evidence) -> Iterator[Finding]:
+    """Findings about clocks, of the motion in the images."""
     if evidence.unsynchronised and not _in_step(evidence):
         yield Finding(
             "unsynchronised",
