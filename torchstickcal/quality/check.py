@@ -36,6 +36,9 @@ _PRIOR_M, _PRIOR_RAD = 0.3, 0.2
 _HARMLESS_DEG, _HARMLESS_M = 0.05, 0.003
 """A change that no lab would calibrate again for."""
 _LEAST_AGREEING, _SOUND_SHARE = 0.5, 0.6
+_BEHIND_OTHERS, _LOST_SHARE = 0.85, 0.3
+"""Share of a camera over the median, below which it is looked at whether its keypoints ceased to agree at some frame, and the
+share that must have."""
 _WRONG_LENGTH_SHARE = 0.02
 
 
@@ -171,11 +174,11 @@ class _Rig:
 def _checked(old: OldRig, observations: Observations) -> Quality:
     rig = _Rig(old, observations)
     cameras = range(observations.num_cameras)
-    since = motion_of(rig.pulls, rig.rotations, rig.translations)
     found: list[Finding] = []
-    if since is not None and since.evidence > LEAST_EVIDENCE and not since.gradual and len(cameras) > 2:
-        rig.place_again(since.camera, since.frame)
-        found.append(_change(rig, observations, since.camera, since.evidence, since.frame))
+    if (step := _step_within(rig)) is not None and len(cameras) > 2:
+        camera, place, strength = step
+        rig.place_again(camera, place)
+        found.append(_change(rig, observations, camera, strength, place))
     for _ in range(max(1, len(cameras) - 2)):
         left = [camera for camera in cameras if camera not in rig.moved]
         doubtful = [camera for camera in left if float(rig.shares[camera]) < _LEAST_AGREEING]
@@ -203,6 +206,30 @@ def _checked(old: OldRig, observations: Observations) -> Quality:
         )
     found += _lengths(rig, observations)
     return Quality.of(found)
+
+
+def _step_within(rig: _Rig) -> tuple[int, int, float] | None:
+    """The camera that moved during the recording, the first of the frames after it, and the evidence; None if none did.
+
+    After a large step few keypoints of the camera agree, after a small one they pull at it.
+    """
+    shares = rig.shares
+    camera = int(shares.argmin())
+    if float(shares[camera]) < _BEHIND_OTHERS * float(shares.median()):
+        m = rig.measurements
+        seen = m.by_frame(m.visible[0])[camera].sum(-1).double()
+        missing = rig.agreeing[0, camera].sum(-1).double() - float(shares[camera]) * seen
+        place = int(missing.cumsum(0).argmax()) + 1
+        before, after = (
+            float(rig.agreeing[0, camera][part].sum() / seen[part].sum().clamp_min(1))
+            for part in (slice(place), slice(place, None))
+        )
+        if before - after > _LOST_SHARE and 0 < place < m.frames:
+            return camera, place, torch.inf
+    since = motion_of(rig.pulls, rig.rotations, rig.translations)
+    if since is None or since.evidence < LEAST_EVIDENCE or since.gradual:
+        return None
+    return since.camera, since.frame, since.evidence
 
 
 def _change(rig: _Rig, observations: Observations, camera: int, strength: float, place: int = 0) -> Finding:

@@ -45,5 +45,5 @@ def motion(evidence: Evidence) -> Iterator[Finding]:
         figure=found.evidence**0.5,
         limit=LEAST_EVIDENCE**0.5,
         unit="standard deviations",
-        is_cause=evidence.consistent,
+        is_cause=True,
     )

@@ -41,7 +41,7 @@ def clocks(evidence: Evidence) -> Iterator[Finding]:
             Severity.SERIOUS,
             "The cameras do not seem to be synchronised: other frames fit together better than those of equal number or time.",
             "Estimate the time offsets (refine 'time_offset').",
-            is_cause=evidence.consistent and evidence.explains_most("clock"),
+            is_cause=evidence.explains_most("clock"),
         )
     for camera, reason in enumerate(evidence.clocks.reasons if evidence.clocks is not None else ()):
         if reason:
@@ -89,7 +89,7 @@ def _contradicted(evidence: Evidence, unknown: CameraUnknown, parameter: CameraP
             figure=(value - given) / std if std > 0 else None,
             limit=_CONTRADICTED_SIGMAS,
             unit="standard deviations",
-            is_cause=matters and evidence.consistent and evidence.explains_most(unknown.family),
+            is_cause=matters and evidence.explains_most(unknown.family),
         )
 
 
@@ -118,7 +118,7 @@ def _different(evidence: Evidence, unknown: CameraUnknown, parameter: CameraPara
             figure=float(evidence.contradictions[unknown.name][camera].sqrt()),
             limit=_CLEAR_SIGMAS,
             unit="standard deviations",
-            is_cause=evidence.consistent and evidence.explains_most("lens"),
+            is_cause=evidence.explains_most("lens"),
         )
 
 
