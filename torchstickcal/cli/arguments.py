@@ -80,8 +80,8 @@ def _add_check(commands: Any) -> None:
     command = commands.add_parser(
         "check",
         help="is an old calibration still valid for a new session of the same cameras?",
-        description="Say whether an old calibration is still valid for a new session of the same cameras: which camera moved, how "
-        "far, and since when. The exit status is 0 if it is valid, 3 if it is not.",
+        description="Say whether an old calibration is still valid for a new session of the same cameras: which camera moved, "
+        "how far, and since when. The exit status is 0 if it is valid, 3 if it is not.",
     )
     command.add_argument(
         "calibration", metavar="CALIBRATION", type=_path, help="folder that `calibrate` wrote, or a calibration file"

@@ -127,8 +127,10 @@ class Evidence:
 
     @cached_property
     def centre_std_m(self) -> Tensor:
-        """(C,), standard deviation of each camera's centre, metres; NaN where cameras were not estimated."""
-        return centre_covariances(self.centres, self._pose_covariance).diagonal(dim1=1, dim2=2).sum(1).sqrt()
+        """(C,), standard deviation of each camera's centre by the errors of the keypoints, metres; NaN where cameras were not
+        estimated."""
+        poses = slice(0, 6 * (self.cameras - 1))
+        return centre_covariances(self.centres, self.noise[poses, poses]).diagonal(dim1=1, dim2=2).sum(1).sqrt()
 
     @cached_property
     def scale_std(self) -> float:

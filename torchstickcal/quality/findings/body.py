@@ -65,7 +65,7 @@ def _height(evidence: Evidence, places: dict[str, int]) -> Iterator[Finding]:
         figure=height,
         limit=_TALL_M if height > _TALL_M else _SHORT_M,
         unit="m",
-        is_cause=True,
+        is_cause=evidence.consistent,
     )
 
 
@@ -116,5 +116,5 @@ def _mirrored(evidence: Evidence, places: dict[str, int]) -> Iterator[Finding]:
             figure=share,
             limit=_MIRRORED_SHARE,
             unit="share",
-            is_cause=True,
+            is_cause=evidence.consistent,
         )

@@ -36,10 +36,17 @@ def _values(evidence: Evidence) -> Iterator[Finding]:
     total = max(1, int(visible.sum()))
     for sentence in observations.warnings:
         share = int(((observations.keypoints == 0).all(-1) & visible).sum()) / total
-        severity = Severity.CAUTION if share > _CORNER_SHARE else Severity.NOTE
+        many = share > _CORNER_SHARE
         meaning, advice = sentence.rsplit(" Set them", 1)
         yield Finding(
-            "keypoints_at_corner", severity, meaning, f"Set them{advice}", figure=share, limit=_CORNER_SHARE, unit="share"
+            "keypoints_at_corner",
+            Severity.SERIOUS if many else Severity.NOTE,
+            meaning,
+            f"Set them{advice}",
+            figure=share,
+            limit=_CORNER_SHARE,
+            unit="share",
+            is_cause=many,
         )
     given = observations.keypoints[visible]
     noise = float(evidence.sigma_px.median())
