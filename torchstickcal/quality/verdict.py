@@ -11,7 +11,12 @@ from torchstickcal.quality.finding import Finding, Severity
 
 
 class Verdict(enum.StrEnum):
-    """Whether a result can be used."""
+    """Whether a result can be used.
+
+    Example:
+        >>> Verdict.USABLE.acceptable, Verdict.POOR.acceptable, str(Verdict.POOR)
+        (True, False, 'poor')
+    """
 
     GOOD = "good"
     """nothing speaks against it"""
