@@ -19,6 +19,9 @@ if TYPE_CHECKING:
     from torchstickcal.observations import Observations
     from torchstickcal.pipeline.calibrate import Callback, calibrate
     from torchstickcal.pipeline.triangulate import triangulate
+    from torchstickcal.quality.check import check
+    from torchstickcal.quality.finding import Finding, Severity
+    from torchstickcal.quality.verdict import Quality, Verdict
     from torchstickcal.reconstruction import Reconstruction
     from torchstickcal.result import Calibration
     from torchstickcal.show.tensorboard import TensorBoardMonitor
@@ -36,6 +39,7 @@ _HOMES = {
     "ConfigError": "errors",
     "Extrinsics": "extrinsics",
     "FileFormatError": "errors",
+    "Finding": "quality.finding",
     "GaussNewton": "solvers.gradients",
     "GradientMode": "solvers.gradients",
     "Implicit": "solvers.gradients",
@@ -44,11 +48,15 @@ _HOMES = {
     "ObservationError": "errors",
     "Observations": "observations",
     "Reconstruction": "reconstruction",
+    "Quality": "quality.verdict",
     "RigError": "errors",
+    "Severity": "quality.finding",
     "Stick": "stick",
     "TensorBoardMonitor": "show.tensorboard",
     "Unrolled": "solvers.gradients",
+    "Verdict": "quality.verdict",
     "calibrate": "pipeline.calibrate",
+    "check": "quality.check",
     "config_names": "config",
     "load_config": "config",
     "triangulate": "pipeline.triangulate",
@@ -64,6 +72,7 @@ __all__ = [
     "ConfigError",
     "Extrinsics",
     "FileFormatError",
+    "Finding",
     "GaussNewton",
     "GradientMode",
     "Implicit",
@@ -71,12 +80,16 @@ __all__ = [
     "LayerResult",
     "ObservationError",
     "Observations",
+    "Quality",
     "Reconstruction",
     "RigError",
+    "Severity",
     "Stick",
     "TensorBoardMonitor",
     "Unrolled",
+    "Verdict",
     "calibrate",
+    "check",
     "config_names",
     "load_config",
     "triangulate",

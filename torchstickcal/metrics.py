@@ -28,6 +28,8 @@ class PoseErrors:
     """(..., C)"""
     translation_m: Tensor
     """(..., C), distance of the camera centres"""
+    aligned_by: str = "camera centres"
+    """what was laid onto the truth before the comparison, and how"""
 
     @property
     def mean_rotation_deg(self) -> float:
@@ -78,11 +80,19 @@ def pose_errors(
     )
     centres, true_centres = se3.camera_centres(r, t), se3.camera_centres(r_true, t_true)
     by_first = r_true[..., 0, :, :].mT @ r[..., 0, :, :]
-    scale = centres.new_ones(())
+    scale, cameras = centres.new_ones(()), r_true.shape[-3]
+    aligned_by = "nothing"
     if alignment in ("rigid", "similarity"):
         spread = torch.linalg.svdvals((true_centres - true_centres.mean(-2, keepdim=True)).detach())
         collinear = (spread[..., 1] <= _COLLINEAR * spread[..., 0])[..., None, None]
         by_centres, _ = align(centres, true_centres)
+        by = (
+            "pose of the first camera (the centres lie on one line)"
+            if bool(collinear.all())
+            else f"all {cameras} camera centres"
+        )
+        freely = "and translation, no scale" if alignment == "rigid" else ", translation and scale"
+        aligned_by = f"{by}, rotation {freely}".replace(" ,", ",")
         rotation = by_first.where(collinear, by_centres)
         moved = centres @ rotation.mT
         if alignment == "similarity":
@@ -91,7 +101,7 @@ def pose_errors(
         at_first = true_centres[..., 0, :] - scale[..., None] * moved[..., 0, :]
         offset = at_first.where(collinear[..., 0], true_centres.mean(-2) - scale[..., None] * moved.mean(-2))
     elif alignment == "first_camera":
-        rotation = by_first
+        rotation, aligned_by = by_first, "pose of the first camera, rotation and translation, no scale"
         offset = true_centres[..., 0, :] - (rotation @ centres[..., 0, :, None])[..., 0]
     elif alignment == "none":
         rotation, offset = torch.eye(3).to(r), r.new_zeros(3)
@@ -102,6 +112,7 @@ def pose_errors(
     return PoseErrors(
         rotation_deg=rotation_angle(r_true @ rotation[..., None, :, :] @ r.mT).rad2deg(),
         translation_m=(laid - true_centres).norm(dim=-1),
+        aligned_by=aligned_by,
     )
 
 

@@ -40,12 +40,23 @@ def calibrate_session(options: argparse.Namespace) -> int:
     observations = _with_stick(session.observations, options.stick_length, options.stick_sigma)
     check_frame_rate(writers, observations)
     calibration = calibrate(observations, config, Progress(_monitor(options.tensorboard)), refine, initial=initial)
+    if options.split_moved and (split := _split(observations, calibration)) is not None:
+        calibration = calibrate(split, config, Progress(_monitor(options.tensorboard)), refine)
     calibration, sentences = placed(calibration, world)
     for sentence in sentences:
         print(f"note: {sentence}", file=sys.stderr)
     with atomic_set(options.out) as folder:
         write_results(calibration, folder, writers, _provenance(options, [*session.notes, *sentences]))
-    return show_results(calibration, options.out, writers)
+    return show_results(calibration, options.out, writers, options.strict)
+
+
+def _split(observations: Observations, calibration: Calibration) -> Observations | None:
+    """The observations with the camera that moved as two; None if none moved at some frame."""
+    for finding in calibration.quality.findings:
+        if finding.code == "camera_moved" and finding.frames and finding.cameras:
+            camera = observations.camera_labels.index(finding.cameras[0])
+            return observations.with_camera_split(camera, finding.frames[0])
+    return None
 
 
 def given_of(options: argparse.Namespace) -> Given:

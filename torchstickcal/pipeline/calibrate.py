@@ -18,7 +18,7 @@ from torchstickcal.pipeline.check import CameraCheck
 from torchstickcal.pipeline.conclude import conclude
 from torchstickcal.pipeline.run import Run
 from torchstickcal.pipeline.selection import ModelSelection
-from torchstickcal.pipeline.start import CONTRADICTED_START, Poses, starting_from
+from torchstickcal.pipeline.start import Poses, starting_from
 from torchstickcal.result import Calibration
 from torchstickcal.solvers import IterationRecord, ignore_record
 from torchstickcal.workers import on_worker
@@ -140,12 +140,10 @@ def _calibrated(
     # 5. Trajectories: with the cameras fixed, smooth each point as its noise and its motion demand.
     ended = adjust_points(adjusted, run)
 
-    # 6. Conclude: covariance, warnings, and the result in the caller's dtype.
+    # 6. Conclude: covariance, and the result in the caller's dtype. Its quality is judged when it is first asked for.
     unsynchronised = config.synchronise and "time_offset" not in ended.refined and models.unsynchronised
     run.took("total", time.perf_counter() - began)
-    calibration = conclude(ended, check, clocks, unsynchronised, left_out, run.seconds)
-    if models.start_contradicted:
-        calibration = replace(calibration, warnings=(*calibration.warnings, CONTRADICTED_START))
+    calibration = conclude(ended, check, clocks, unsynchronised, left_out, models.start_contradicted, run)
     if callback:
         callback.on_end(calibration)
     return calibration

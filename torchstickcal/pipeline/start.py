@@ -18,10 +18,6 @@ if TYPE_CHECKING:
 Poses = tuple[Tensor, Tensor]
 """Rotations (C, 3, 3) and translations (C, 3), world to camera."""
 
-CONTRADICTED_START = (
-    "The keypoints contradict the poses that were given as a start, which were not used. Check that they are of the same "
-    "cameras, and that none has been moved since."
-)
 _LEAST_DISTANCE = 1e-9
 
 

@@ -23,7 +23,8 @@ from torchstickcal.pipeline.run import Run
 from torchstickcal.pipeline.stage import run_stage
 from torchstickcal.pipeline.start import cameras_of
 from torchstickcal.pipeline.synchronise import on_common_frames, search_offsets, unsynchronised
-from torchstickcal.pipeline.warnings import keypoint_warnings
+from torchstickcal.quality.evidence import Evidence
+from torchstickcal.quality.findings.keypoints import keypoints as keypoint_findings
 from torchstickcal.reconstruction import Reconstruction
 from torchstickcal.result import Calibration
 from torchstickcal.solvers.elimination.normal_equations import NormalEquations
@@ -156,7 +157,7 @@ def _reconstructed(
         adjusted = through([(_ROBUST, robust)], replace(adjusted, results=(), records=((),)), run)
     if smooth is not None:
         adjusted = through([(_SMOOTH, smooth)], adjusted, run)
-    return _concluded(adjusted, clocks, covariance)
+    return _concluded(adjusted, clocks, covariance, run)
 
 
 def _stages(config: Config) -> tuple[Stage, Stage | None]:
@@ -246,7 +247,7 @@ def _certain(offsets: Tensor, std: Tensor) -> bool:
     return bool(((offsets.abs() > _CLOCK_SIGMAS * std) & (offsets.abs() > _CLOCK_FRAMES)).any())
 
 
-def _concluded(ended: Adjustment, clocks: _Clocks | None, covariance: Tensor) -> Reconstruction:
+def _concluded(ended: Adjustment, clocks: _Clocks | None, covariance: Tensor, run: Run) -> Reconstruction:
     observations, frames, measurements = ended.observations[0], ended.frames[0], ended.measurements
     inliers, sigma_px = measurements.by_frame(ended.last.inliers[0]), ended.last.sigma_px[0]
     points = measurements.by_frame(ended.state.points[0]).where(inliers.any(0), torch.nan).movedim(0, -1)
@@ -258,6 +259,7 @@ def _concluded(ended: Adjustment, clocks: _Clocks | None, covariance: Tensor) ->
         measurements.cameras_at(ended.state).to(torch.float64)[0],
         covariance,
     )
+    evidence = Evidence(ended, {}, covariance, torch.zeros_like(covariance), None, False, (), run.config)
     ends = torch.tensor([stick.ends for stick in observations.sticks], dtype=torch.long).view(-1, 2)
     offsets = frames.offsets_frames + (0.0 if clocks is None else clocks.offsets_frames)
     std = torch.full_like(offsets, torch.nan) if clocks is None else clocks.std_frames
@@ -285,5 +287,5 @@ def _concluded(ended: Adjustment, clocks: _Clocks | None, covariance: Tensor) ->
         point_names=observations.point_names,
         camera_names=observations.camera_labels,
         world=World(),
-        warnings=keypoint_warnings(ended),
+        warnings=tuple(finding.text for finding in keypoint_findings(evidence)),
     )

@@ -9,6 +9,7 @@ from torch import Tensor
 
 from torchstickcal.files import without_nan
 from torchstickcal.model.unknowns import all_unknowns
+from torchstickcal.quality.finding import Severity
 from torchstickcal.result import Calibration, CameraParameter
 
 
@@ -41,7 +42,7 @@ def table(calibration: Calibration) -> str:
         if known and (parameter.refined or all_unknowns()[name].noticeable_prior_share is not None):
             text += [aligned(_parameter_rows(calibration, parameter)), ""]
     if calibration.sticks:
-        rows = [["stick", "given (m)", "mean (m)", "spread (mm)", "frames"]]
+        rows = [["stick, fitted", "given (m)", "mean (m)", "spread (mm)", "frames"]]
         for stick, lengths in zip(calibration.sticks, calibration.stick_lengths_m.mT, strict=True):
             known = lengths[lengths.isfinite()]
             spread = f"{1000 * float(known.std()):.2f}" if len(known) > 1 else "-"
@@ -56,7 +57,8 @@ def table(calibration: Calibration) -> str:
         rows.append([stage.name, str(last.iteration), f"{last.cost:.6g}", f"{1000 * stage.seconds:.1f}", str(stage.stop)])
     rows.append(["total", "", "", f"{1000 * calibration.seconds['total']:.1f}", ""])
     text.append(aligned(rows))
-    text += ["", *(f"warning: {warning}" for warning in calibration.warnings)] if calibration.warnings else []
+    notes = [finding for finding in calibration.quality.findings if finding.severity == Severity.NOTE]
+    text += ["", *(f"note: {finding.text}" for finding in notes)] if notes else []
     return "\n".join(text)
 
 
@@ -64,6 +66,7 @@ def summary(calibration: Calibration) -> dict[str, Any]:
     """The calibration without its arrays, as JSON can hold it: None where a number is not known."""
     return without_nan(
         {
+            "quality": calibration.quality.as_json(),
             "status": calibration.status,
             "converged": calibration.converged,
             "world": dataclasses.asdict(calibration.world),
