@@ -54,7 +54,7 @@ def findings(
         >>> from torchstickcal.quality.finding import Finding, Severity
         >>> @findings("slow", "sessions of a low frame rate")
         ... def slow(evidence):
-        ...     if (evidence.observations.fps or 100) < 25:
+        ...     if (evidence.observations.fps or 100) < 5:
         ...         yield Finding("low_frame_rate", Severity.CAUTION, "The frame rate is low.")
     """
 
