@@ -1,0 +1,191 @@
+"""Smoothing by local polynomials, over as many frames as the motion allows.
+
+Around each frame a cubic polynomial is fitted to the frames before and after it. A long window averages more noise, a short one
+follows a fast swing. The window is the longest whose estimates, of position and velocity, agree with those of all shorter ones
+within their standard deviations (intersection of confidence intervals: Goldenshluger and Nemirovski, 1997).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+Neighbours = Callable[[Array, int], Array]
+"""Values (..., T, S, D), and an offset in frames, to the values of those frames as they are averaged, (..., T, S, D)"""
+
+HALF_WIDTHS = (3, 4, 5, 6, 8, 10, 13, 16, 20, 25, 32, 40)
+"""Frames before and after."""
+_ORDER = 3
+_AGREEMENT = 1.3
+"""How many standard deviations, root mean square over the axes, estimates may differ by chance."""
+_FARTHEST_FRAMES = 3
+"""How far from a frame in which a point is known it is still estimated."""
+_STEADY_FRAMES = 2
+"""The window of a frame is the median over so many frames before and after it."""
+_LEAST_CONDITION = 1e-7
+
+
+def shifted(values: Array, offset: int) -> Array:
+    """Values (..., T, S, D) of ``offset`` frames later; NaN where there is none.
+
+    Example:
+        >>> shifted(np.arange(3.0).reshape(3, 1, 1), 1).ravel()
+        array([ 1.,  2., nan])
+    """
+    out = np.full_like(values, np.nan)
+    frames = values.shape[-3]
+    if abs(offset) < frames:
+        to, of = slice(max(0, -offset), frames - max(0, offset)), slice(max(0, offset), frames + min(0, offset))
+        out[..., to, :, :] = values[..., of, :, :]
+    return out
+
+
+@dataclass(frozen=True, eq=False)
+class Smoother:
+    """The weights with which frames are averaged. The same weights smooth the estimate and what its errors may be."""
+
+    weights: Array
+    """(O, T, S, 2), of each offset, for the value and for its derivative by time; NaN where nothing can be estimated"""
+    neighbours: Neighbours
+
+    def __call__(self, values: Array) -> tuple[Array, Array]:
+        """Values (..., T, S, D), smoothed, and their derivatives by time, per second."""
+        reach = len(self.weights) // 2
+        value, slope = np.zeros_like(values), np.zeros_like(values)
+        for offset, weights in zip(range(-reach, reach + 1), self.weights, strict=True):
+            used = (weights != 0).any(-1)[..., None]
+            if used.any():
+                near = np.where(used, self.neighbours(values, offset), 0.0)
+                value += weights[..., :1] * near
+                slope += weights[..., 1:] * near
+        return value, slope
+
+    @property
+    def gains(self) -> Array:
+        """(T, S, 2), root of the sum of the squared weights: what becomes of independent errors of 1."""
+        return np.sqrt(np.square(self.weights).sum(0))
+
+
+def smoother(times: Array, values: Array, variances: Array, neighbours: Neighbours = shifted) -> Smoother:
+    """Choose windows for tracks.
+
+    Args:
+        times: (T,), seconds, ascending.
+        values: (T, S, D), NaN where not known.
+        variances: (T, S), of the values along each of the D axes.
+        neighbours: how values of other frames are seen from a frame.
+
+    Example:
+        >>> times, rng = np.arange(200) / 100, np.random.default_rng(0)
+        >>> track = np.sin(2 * np.pi * times)[:, None, None] + 0.01 * rng.standard_normal((200, 1, 1))
+        >>> smooth = smoother(times, track, np.full((200, 1), 1e-4))
+        >>> value, slope = smooth(track)
+        >>> bool(np.abs(value[:, 0, 0] - np.sin(2 * np.pi * times)).max() < 0.02)
+        True
+        >>> bool(smooth.gains[100, 0, 0] < 0.5)
+        True
+    """
+    frames, count = values.shape[:2]
+    reach = max(width for width in HALF_WIDTHS if width < max(frames, HALF_WIDTHS[0] + 1))
+    step = float(np.median(np.diff(times))) if frames > 1 else 1.0
+    offsets = range(-reach, reach + 1)
+    at = [(shifted(times[:, None, None], offset) - times[:, None, None])[..., 0] / step for offset in offsets]
+    near = [neighbours(values, offset) for offset in offsets]
+    inverse = np.where(np.isfinite(values).all(-1) & np.isfinite(variances) & (variances > 0), 1 / variances, 0.0)
+    information = [np.nan_to_num(shifted(inverse[..., None], offset)[..., 0]) for offset in offsets]
+    powers = [np.nan_to_num(a[..., None] ** np.arange(_ORDER + 1)) for a in at]
+
+    moments = np.zeros((frames, count, _ORDER + 1, _ORDER + 1))
+    sums = np.zeros((frames, count, _ORDER + 1, values.shape[-1]))
+    tried: list[tuple[Array, Array, Array]] = []
+    widths = [width for width in HALF_WIDTHS if width <= reach]
+    before = -1
+    for width in widths:
+        for distance in range(before + 1, width + 1):
+            for number in {reach - distance, reach + distance}:
+                weighted = information[number][..., None] * powers[number]
+                moments += weighted[..., :, None] * powers[number][..., None, :]
+                sums += weighted[..., :, None] * np.nan_to_num(near[number])[..., None, :]
+        before = width
+        covariance = _inverse(moments)
+        estimate = covariance[..., :2, :] @ sums
+        tried.append((covariance[..., :2, :], estimate, np.diagonal(covariance, axis1=-2, axis2=-1)[..., :2]))
+    chosen = _steady(_longest(tried))
+    rows = np.take_along_axis(np.stack([rows for rows, _, _ in tried]), chosen[None, ..., None, None], 0)[0]
+    width = np.array(widths)[chosen]
+    weights = np.zeros((len(offsets), frames, count, 2))
+    for number, offset in enumerate(offsets):
+        linear = (rows @ powers[number][..., None])[..., 0] * information[number][..., None]
+        weights[number] = np.where((np.abs(offset) <= width)[..., None], linear / [1.0, step], 0.0)
+    known = np.isfinite(rows).all((-2, -1)) & _near_a_value(inverse > 0)
+    return Smoother(np.where(known[..., None], np.nan_to_num(weights), np.nan), neighbours)
+
+
+def _inverse(moments: Array) -> Array:
+    """Inverses (..., n, n) of moments; NaN where a polynomial is not determined."""
+    scale = np.sqrt(np.maximum(np.diagonal(moments, axis1=-2, axis2=-1), 1e-300))
+    scaled = moments / scale[..., :, None] / scale[..., None, :]
+    determined = np.linalg.eigvalsh(scaled)[..., 0] > _LEAST_CONDITION
+    safe = np.where(determined[..., None, None], scaled, np.eye(moments.shape[-1]))
+    inverse = np.linalg.inv(safe) / scale[..., :, None] / scale[..., None, :]
+    return np.where(determined[..., None, None], inverse, np.nan)
+
+
+def _longest(tried: list[tuple[Array, Array, Array]]) -> NDArray[np.intp]:
+    """(T, S), number of the longest window that agrees with all shorter ones; the first one that is determined at least."""
+    shape = tried[0][1].shape[:2]
+    chosen = np.zeros(shape, dtype=np.intp)
+    open_ = np.ones(shape, dtype=bool)
+    for number, (_, estimate, variance) in enumerate(tried):
+        determined = np.isfinite(estimate).all((-2, -1))
+        agrees = determined.copy()
+        for _, other, more in tried[:number]:
+            difference = np.square(estimate - other).mean(-1)
+            spread = np.maximum(more - variance, 1e-12 * more)
+            comparable = np.isfinite(difference)
+            agrees &= (~comparable | (difference <= _AGREEMENT**2 * spread)).all(-1)
+        undetermined_before = ~np.isfinite(np.take_along_axis(np.stack([e[..., 0, 0] for _, e, _ in tried]), chosen[None], 0)[0])
+        open_ &= agrees | ~determined | undetermined_before
+        chosen = np.where(determined & open_, number, chosen)
+    return chosen
+
+
+def _steady(chosen: NDArray[np.intp]) -> NDArray[np.intp]:
+    """The median of the windows over neighbouring frames."""
+    padded = np.pad(chosen, ((_STEADY_FRAMES, _STEADY_FRAMES), (0, 0)), mode="edge")
+    windows = np.lib.stride_tricks.sliding_window_view(padded, 2 * _STEADY_FRAMES + 1, axis=0)
+    return np.median(windows, axis=-1).astype(np.intp)
+
+
+def _near_a_value(known: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """(T, S), whether a value is known at most :data:`_FARTHEST_FRAMES` away."""
+    padded = np.pad(known, ((_FARTHEST_FRAMES, _FARTHEST_FRAMES), (0, 0)))
+    return np.lib.stride_tricks.sliding_window_view(padded, 2 * _FARTHEST_FRAMES + 1, axis=0).any(-1)
+
+
+def on_sphere(base: Array) -> Neighbours:
+    """Unit vectors (..., T, S, 3) of other frames as tangents of the sphere at the unit vectors ``base`` (T, S, 3) of each frame.
+
+    In these coordinates a direction that turns evenly is a straight line, which a polynomial follows without bending it.
+    """
+
+    def seen(directions: Array, offset: int) -> Array:
+        there = shifted(directions, offset)
+        cosine = np.clip((there * base).sum(-1, keepdims=True), -1.0, 1.0)
+        aside = there - cosine * base
+        sine = np.linalg.norm(aside, axis=-1, keepdims=True)
+        return aside * np.arctan2(sine, cosine) / np.maximum(sine, 1e-12)
+
+    return seen
+
+
+def from_sphere(base: Array, tangents: Array, slopes: Array) -> tuple[Array, Array]:
+    """Unit vectors and their derivatives, (..., T, S, 3), of tangents at ``base`` and the derivatives of these."""
+    angle = np.linalg.norm(tangents, axis=-1, keepdims=True)
+    shrink = np.sinc(angle / np.pi)
+    unit = np.cos(angle) * base + shrink * tangents
+    return unit, shrink * (slopes - (tangents * slopes).sum(-1, keepdims=True) * base)
