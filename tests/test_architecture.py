@@ -39,6 +39,7 @@ FLOORS = [
     ["layer"],
     ["show"],
     ["io"],
+    ["analysis"],
     ["simulate"],
     ["benchmark.baselines"],
     ["benchmark"],

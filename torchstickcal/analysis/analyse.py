@@ -15,6 +15,7 @@ from torchstickcal.analysis.smoothing import smoother
 from torchstickcal.analysis.stick import StickMotion, StickSmoother
 from torchstickcal.analysis.tracks import Tracks, tracks_of
 from torchstickcal.errors import CalibrationError
+from torchstickcal.io.skeletons import conventional
 from torchstickcal.result import Calibration
 
 Array = NDArray[np.float64]
@@ -176,8 +177,7 @@ def _angles(tracks: Tracks, drawn: Array, events: Array) -> tuple[dict[str, Arra
     derived = with_derived(tracks.names, tracks.points, tracks.up)
     possible = {name: angle for name, angle in ANGLES.items() if not missing_points(angle, derived)}
     left_out = [name for name in ANGLES if name not in possible]
-    used = {index for index, name in enumerate(tracks.names) if _is_needed(name, tracks.names, possible)}
-    index = sorted(used)
+    index = [number for number, name in enumerate(tracks.names) if conventional(name) in _needed(possible)]
     smooth, _ = smoother(tracks.times, tracks.points[:, index], tracks.variances[:, index])(drawn[:, :, index])
     points = with_derived(tuple(tracks.names[number] for number in index), smooth, tracks.up)
     values = {name: _without_jumps(angle.of(points)) for name, angle in possible.items()}
@@ -187,11 +187,11 @@ def _angles(tracks: Tracks, drawn: Array, events: Array) -> tuple[dict[str, Arra
     return values, notes
 
 
-def _is_needed(name: str, names: tuple[str, ...], angles: Mapping[str, Angle]) -> bool:
-    """Whether an angle would be missing without a point."""
-    others = tuple(other for other in names if other != name)
-    without = with_derived(others, np.zeros((1, len(others), 3)), np.ones(3))
-    return any(missing_points(angle, without) for angle in angles.values()) or name.lower() in ("left_hip", "right_hip")
+def _needed(angles: Mapping[str, Angle]) -> set[str]:
+    """Names of the points that angles need, those from which others are derived included."""
+    needs = {need for angle in angles.values() for need in angle.needs}
+    derived = {"left_hip", "right_hip", "pelvis", "hip", "left_shoulder", "right_shoulder"} if "trunk" in needs else set()
+    return needs | derived
 
 
 def _without_jumps(degrees: Array) -> Array:

@@ -20,8 +20,12 @@ Array = NDArray[np.float64]
 EVENTS = ("takeaway", "top", "impact", "finish")
 """What divides a swing: address | backswing | downswing | follow-through."""
 
-ONSET = 0.05
-"""Share of the largest turn rate of a swing at which the downswing begins and the follow-through ends."""
+ONSET = 0.10
+"""Share of the largest turn rate of a swing at which the downswing begins."""
+ENDED = 0.05
+"""Share of the largest turn rate of a swing at which the follow-through ends."""
+FAST_AGAIN = 0.3
+"""Share of the largest turn rate by which the stick turned faster before a moment, for that moment to be between two swings."""
 BACKSWING_DEG = 10.0
 """How far the stick has turned from the top when the search for the takeaway begins."""
 STOPPED = 0.10
@@ -42,7 +46,7 @@ class Sport:
     rule: str
     impact: Search
     needs_up: bool = False
-    takeaway: float = 0.10
+    takeaway: float = 0.20
     """share of the largest turn rate of the backswing at which it begins"""
 
 
@@ -96,10 +100,11 @@ SPORTS: dict[str, Sport] = {
 
 RULES = {
     "swing": f"around each peak of the stick's turn rate of at least {SAME_ACTION:.0%} of the largest one, and {APART_S:g} s from a higher one",
-    "takeaway": "the last time before the backswing at which the stick turned at less than 10 % of the backswing's rate (baseball, "
+    "takeaway": "the last time before the backswing at which the stick turned at less than 20 % of the backswing's rate (baseball, "
     "where a bat moves little before the swing: 30 %)",
-    "top": f"the last time before the peak at which the stick turned at less than {ONSET:.0%} of the peak's rate",
-    "finish": f"the first time after peak and impact at which the stick turns at less than {ONSET:.0%} of the peak's rate",
+    "top": f"the last time before the peak at which the stick turned at less than {ONSET:.0%} of the peak's rate; if "
+    "it never did since the backswing, the moment at which it turned slowest",
+    "finish": f"the first time after peak and impact at which the stick turns at less than {ENDED:.0%} of the peak's rate",
 }
 """The rules for the other events, the same for all sports."""
 
@@ -133,7 +138,7 @@ def swing_peaks(times: Array, rate: Array) -> list[int]:
         peak = int(np.where(taken, 0.0, known).argmax())
         if taken[peak] or known[peak] < SAME_ACTION * largest:
             break
-        slow = known < ONSET * known[peak]
+        slow = known < ENDED * known[peak]
         before, after = np.flatnonzero(slow[:peak]), np.flatnonzero(slow[peak:])
         first, last = (before[-1] if len(before) else 0), (peak + after[0] if len(after) else len(known) - 1)
         if all(abs(times[peak] - times[other]) >= APART_S for other in peaks):
@@ -147,8 +152,8 @@ def events_of(times: Array, motion: StickMotion, peak: int, sport: Sport, up: Ar
     rate, tip, speed = motion.turn_rate[number], motion.tip[number], motion.tip_speed[number]
     reach = np.flatnonzero(np.abs(times - times[peak]) < 0.05)
     peak = int(reach[np.nanargmax(rate[reach])])
-    top = _rises_above(times, rate, peak, ONSET * rate[peak])
-    finish = _falls_below(times, rate, peak, ONSET * rate[peak])
+    top = _top(times, rate, peak)
+    finish = _falls_below(times, rate, peak, ENDED * rate[peak])
     takeaway = _takeaway(times, rate, motion.tip[number] - motion.start[number], top, sport.takeaway)
     if sport.needs_up and up is None:
         sport = SPORTS["any"]
@@ -174,13 +179,18 @@ def _takeaway(times: Array, rate: Array, stick: Array, top_s: float, share: floa
     return np.nan
 
 
-def _rises_above(times: Array, values: Array, peak: int, level: float) -> float:
-    """The last time before a peak at which values (T,) rise above a level; NaN if they are not known back to there."""
+def _top(times: Array, rate: Array, peak: int) -> float:
+    """Back from the peak to where the stick turned slowly, or to the slowest moment before it turned fast again."""
+    slowest = peak
     for frame in range(peak - 1, -1, -1):
-        if not np.isfinite(values[frame]):
+        if not np.isfinite(rate[frame]):
             return np.nan
-        if values[frame] < level:
-            return _crossing(times, values, frame, level)
+        if rate[frame] < ONSET * rate[peak]:
+            return _crossing(times, rate, frame, ONSET * rate[peak])
+        if rate[frame] < rate[slowest]:
+            slowest = frame
+        if rate[frame] > rate[slowest] + FAST_AGAIN * rate[peak]:
+            return _lowest_at(times, rate, np.array([slowest]))
     return np.nan
 
 

@@ -20,10 +20,12 @@ Neighbours = Callable[[Array, int], Array]
 HALF_WIDTHS = (3, 4, 5, 6, 8, 10, 13, 16, 20, 25, 32, 40)
 """Frames before and after."""
 _ORDER = 3
-_AGREEMENT = 1.3
+_AGREEMENT = 1.4
 """How many standard deviations, root mean square over the axes, estimates may differ by chance."""
 _FARTHEST_FRAMES = 3
 """How far from a frame in which a point is known it is still estimated."""
+_LONGER_DRAWS = slice(1, None, 4)
+"""Which draws, after the estimate, are smoothed over the next longer windows."""
 _STEADY_FRAMES = 2
 """The window of a frame is the median over so many frames before and after it."""
 _LEAST_CONDITION = 1e-7
@@ -46,22 +48,34 @@ def shifted(values: Array, offset: int) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class Smoother:
-    """The weights with which frames are averaged. The same weights smooth the estimate and what its errors may be."""
+    """The weights with which frames are averaged. The same weights smooth the estimate and the draws of its errors.
+
+    Every fourth draw is smoothed over the next longer window. How much it differs shows how much smoothing itself bends a track.
+    """
 
     weights: Array
     """(O, T, S, 2), of each offset, for the value and for its derivative by time; NaN where nothing can be estimated"""
+    longer: Array
+    """the same of the next longer windows"""
     neighbours: Neighbours
 
     def __call__(self, values: Array) -> tuple[Array, Array]:
-        """Values (..., T, S, D), smoothed, and their derivatives by time, per second."""
-        reach = len(self.weights) // 2
+        """Values (T, S, D), or an estimate and draws of it (N, T, S, D), smoothed, and their derivatives, per second."""
+        smoothed = self._averaged(self.weights, values)
+        if values.ndim == 4:
+            for whole, part in zip(smoothed, self._averaged(self.longer, values[_LONGER_DRAWS]), strict=True):
+                whole[_LONGER_DRAWS] = part
+        return smoothed
+
+    def _averaged(self, weights: Array, values: Array) -> tuple[Array, Array]:
+        reach = len(weights) // 2
         value, slope = np.zeros_like(values), np.zeros_like(values)
-        for offset, weights in zip(range(-reach, reach + 1), self.weights, strict=True):
-            used = (weights != 0).any(-1)[..., None]
+        for offset, of_offset in zip(range(-reach, reach + 1), weights, strict=True):
+            used = (of_offset != 0).any(-1)[..., None]
             if used.any():
                 near = np.where(used, self.neighbours(values, offset), 0.0)
-                value += weights[..., :1] * near
-                slope += weights[..., 1:] * near
+                value += of_offset[..., :1] * near
+                slope += of_offset[..., 1:] * near
         return value, slope
 
     @property
@@ -114,15 +128,19 @@ def smoother(times: Array, values: Array, variances: Array, neighbours: Neighbou
         covariance = _inverse(moments)
         estimate = covariance[..., :2, :] @ sums
         tried.append((covariance[..., :2, :], estimate, np.diagonal(covariance, axis1=-2, axis2=-1)[..., :2]))
-    chosen = _steady(_longest(tried))
-    rows = np.take_along_axis(np.stack([rows for rows, _, _ in tried]), chosen[None, ..., None, None], 0)[0]
-    width = np.array(widths)[chosen]
-    weights = np.zeros((len(offsets), frames, count, 2))
-    for number, offset in enumerate(offsets):
-        linear = (rows @ powers[number][..., None])[..., 0] * information[number][..., None]
-        weights[number] = np.where((np.abs(offset) <= width)[..., None], linear / [1.0, step], 0.0)
-    known = np.isfinite(rows).all((-2, -1)) & _near_a_value(inverse > 0)
-    return Smoother(np.where(known[..., None], np.nan_to_num(weights), np.nan), neighbours)
+    chosen = _steady(_longest(tried, widths))
+    rows_of = np.stack([rows for rows, _, _ in tried])
+    near_a_value = _near_a_value(inverse > 0)
+
+    def weights_of(number: NDArray[np.intp]) -> Array:
+        rows = np.take_along_axis(rows_of, number[None, ..., None, None], 0)[0]
+        weights = np.zeros((len(offsets), frames, count, 2))
+        for k, offset in enumerate(offsets):
+            linear = (rows @ powers[k][..., None])[..., 0] * information[k][..., None]
+            weights[k] = np.where((np.abs(offset) <= np.array(widths)[number])[..., None], linear / [1.0, step], 0.0)
+        return np.where((np.isfinite(rows).all((-2, -1)) & near_a_value)[..., None], np.nan_to_num(weights), np.nan)
+
+    return Smoother(weights_of(chosen), weights_of(np.minimum(chosen + 1, len(widths) - 1)), neighbours)
 
 
 def _inverse(moments: Array) -> Array:
@@ -135,23 +153,30 @@ def _inverse(moments: Array) -> Array:
     return np.where(determined[..., None, None], inverse, np.nan)
 
 
-def _longest(tried: list[tuple[Array, Array, Array]]) -> NDArray[np.intp]:
+def _longest(tried: list[tuple[Array, Array, Array]], widths: list[int]) -> NDArray[np.intp]:
     """(T, S), number of the longest window that agrees with all shorter ones; the first one that is determined at least."""
     shape = tried[0][1].shape[:2]
-    chosen = np.zeros(shape, dtype=np.intp)
-    open_ = np.ones(shape, dtype=bool)
+    chosen = np.full(shape, -1)
+    going_on = np.ones(shape, dtype=bool)
     for number, (_, estimate, variance) in enumerate(tried):
-        determined = np.isfinite(estimate).all((-2, -1))
-        agrees = determined.copy()
-        for _, other, more in tried[:number]:
-            difference = np.square(estimate - other).mean(-1)
-            spread = np.maximum(more - variance, 1e-12 * more)
-            comparable = np.isfinite(difference)
-            agrees &= (~comparable | (difference <= _AGREEMENT**2 * spread)).all(-1)
-        undetermined_before = ~np.isfinite(np.take_along_axis(np.stack([e[..., 0, 0] for _, e, _ in tried]), chosen[None], 0)[0])
-        open_ &= agrees | ~determined | undetermined_before
-        chosen = np.where(determined & open_, number, chosen)
-    return chosen
+        determined = np.isfinite(variance).all(-1)
+        agrees = np.ones(shape, dtype=bool)
+        for (_, other, more), width in zip(tried[:number], widths, strict=False):
+            ratio = np.square(estimate - other).mean(-1) / np.maximum(more - variance, 1e-9 * more)
+            agrees &= (_mean_around(ratio, width) <= _AGREEMENT**2).all(-1)
+        going_on &= agrees | ~determined
+        chosen = np.where(determined & (going_on | (chosen < 0)), number, chosen)
+    return np.maximum(chosen, 0)
+
+
+def _mean_around(values: Array, reach: int) -> Array:
+    """Means of values (T, S, 2) over the known ones of ``reach`` frames before and after; 0 where none is known."""
+    known = np.isfinite(values)
+    sums = np.stack([np.where(known, values, 0.0), known.astype(float)])
+    padded = np.pad(sums.cumsum(1), ((0, 0), (reach + 1, reach), (0, 0), (0, 0)), mode="edge")
+    padded[:, : reach + 1] = 0.0
+    total, count = padded[:, 2 * reach + 1 :] - padded[:, : -2 * reach - 1]
+    return total / np.maximum(count, 1.0)
 
 
 def _steady(chosen: NDArray[np.intp]) -> NDArray[np.intp]:
