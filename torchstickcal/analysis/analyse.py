@@ -101,8 +101,8 @@ def analyse(
 ) -> Analysis:
     """Angles, stick kinematics, phases and repeated swings of a calibrated session.
 
-    Points are triangulated frame by frame and smoothed over as many frames as the motion allows. Standard deviations are those of
-    everything that follows when the errors of keypoints, cameras and stick length are drawn again.
+    Points are triangulated frame by frame and smoothed over as many frames as the motion allows. For the
+    standard deviations, errors of keypoints, cameras and stick length are drawn at random, and all is calculated again.
 
     Args:
         calibration: of the session. Points need the names of a skeleton.

@@ -1,7 +1,7 @@
 """Angles of the body by named conventions. Each says what it is, which points it needs, and where its definition is from.
 
-Points are the centres of joints, so that an angle is one that these points determine. What needs markers on the skin, such as the
-rotation of a forearm about its own axis, is not here.
+Points are the centres of joints, so that an angle is one that these points determine. What needs markers on the skin, such
+as the rotation of a forearm about its own axis, is not here.
 """
 
 from __future__ import annotations
@@ -73,7 +73,7 @@ def _about(axis: Array, first: Array, second: Array) -> Array:
 
 def _heading(line: Array, up: Array) -> Array:
     """Degrees by which the horizontal part of a line is turned about the vertical, from a fixed direction."""
-    fixed = np.cross(up, np.eye(3)[np.argmin(np.abs(up))])
+    fixed: Array = np.cross(up, np.eye(3)[np.argmin(np.abs(up))]).astype(np.float64)
     return _about(np.broadcast_to(up, line.shape), np.broadcast_to(fixed, line.shape), line)
 
 
@@ -121,7 +121,7 @@ ANGLES: dict[str, Angle] = {
     ),
     "trunk_turn": Angle(
         ("left_shoulder", "right_shoulder", "up"),
-        "Turn of the line through both shoulders about the vertical since the takeaway of the first swing, positive to the left.",
+        "Turn of the line through both shoulders about the vertical since the first swing's takeaway, positive to the left.",
         CHEETHAM_2001, lambda p: _heading(p["right_shoulder"] - p["left_shoulder"], p["up"]), turns=True,
     ),
     "pelvis_turn": Angle(
@@ -131,8 +131,8 @@ ANGLES: dict[str, Angle] = {
     ),
     "x_factor": Angle(
         ("left_shoulder", "right_shoulder", "left_hip", "right_hip", "trunk"),
-        "Turn of the line through both shoulders relative to that through both hips, about the long axis of the trunk; positive "
-        "to the left.",
+        "Turn of the line through both shoulders relative to that through both hips, about the long axis of the trunk; "
+        "positive to the left.",
         f"{JOYCE_2010}: axial rotation of the thorax relative to the pelvis",
         lambda p: _about(p["trunk"], p["right_hip"] - p["left_hip"], p["right_shoulder"] - p["left_shoulder"]),
     ),
@@ -153,8 +153,8 @@ ANGLES: dict[str, Angle] = {
 def with_derived(names: tuple[str, ...], points: Array, up: Array | None) -> dict[str, Array]:
     """Points (..., T, P, 3) by their conventional names, with those that are derived.
 
-    ``pelvis`` is the middle between the hips where there are hips, else the point ``pelvis`` or ``hip`` itself. Without hips the
-    thighs begin there. ``trunk`` is the vector from the pelvis to the middle between the shoulders.
+    ``pelvis`` is the middle between the hips where there are hips, else the point ``pelvis`` or ``hip`` itself. ``trunk`` is
+    the vector from the pelvis to the middle between the shoulders.
     """
     found = {conventional(name): points[..., index, :] for index, name in enumerate(names)}
     if "left_hip" in found and "right_hip" in found:
@@ -167,5 +167,5 @@ def with_derived(names: tuple[str, ...], points: Array, up: Array | None) -> dic
 
 
 def missing_points(angle: Angle, points: Points) -> list[str]:
-    """Names of what an angle needs and the points lack; a hip is replaced by the pelvis in angles of the leg."""
+    """Names of what an angle needs and the points lack."""
     return [need for need in angle.needs if need not in points]

@@ -99,12 +99,13 @@ SPORTS: dict[str, Sport] = {
 """The rules for the impact by sport."""
 
 RULES = {
-    "swing": f"around each peak of the stick's turn rate of at least {SAME_ACTION:.0%} of the largest one, and {APART_S:g} s from a higher one",
-    "takeaway": "the last time before the backswing at which the stick turned at less than 20 % of the backswing's rate (baseball, "
-    "where a bat moves little before the swing: 30 %)",
-    "top": f"the last time before the peak at which the stick turned at less than {ONSET:.0%} of the peak's rate; if "
-    "it never did since the backswing, the moment at which it turned slowest",
-    "finish": f"the first time after peak and impact at which the stick turns at less than {ENDED:.0%} of the peak's rate",
+    "swing": f"around each peak of the stick's turn rate of at least {SAME_ACTION:.0%} of the largest one, if no higher "
+    f"peak is within {APART_S:g} s",
+    "takeaway": "the last time before the backswing at which the stick turned at less than 20 % of the largest rate "
+    "in it (baseball, where a bat moves little before the swing: 30 %)",
+    "top": f"the last time before the peak at which the stick turned at less than {ONSET:.0%} of the peak's rate; if it never "
+    "did since the backswing, the moment at which it turned slowest",
+    "finish": f"the first time after the peak at which the stick turns at less than {ENDED:.0%} of the peak's rate",
 }
 """The rules for the other events, the same for all sports."""
 

@@ -10,7 +10,7 @@ from torchstickcal.analysis.phases import EVENTS
 from torchstickcal.analysis.repeats import SHARES
 
 _LEFT, _RIGHT, _MIDDLE = "#1f5fa8", "#d1495b", "#33383d"
-_EVENT_COLOURS = dict(zip(EVENTS, ("#7f8c8d", "#2e7d32", "#b8860b", "#7f8c8d"), strict=True))
+_EVENT_COLOURS: dict[str, str] = dict(zip(EVENTS, ("#7f8c8d", "#2e7d32", "#b8860b", "#7f8c8d"), strict=True))
 _COLUMNS = 3
 
 

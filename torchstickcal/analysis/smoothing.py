@@ -50,7 +50,8 @@ def shifted(values: Array, offset: int) -> Array:
 class Smoother:
     """The weights with which frames are averaged. The same weights smooth the estimate and the draws of its errors.
 
-    Every fourth draw is smoothed over the next longer window. How much it differs shows how much smoothing itself bends a track.
+    Every fourth draw is smoothed over the next longer window. How much it differs shows how much smoothing itself bends a
+    track.
     """
 
     weights: Array
@@ -189,11 +190,11 @@ def _steady(chosen: NDArray[np.intp]) -> NDArray[np.intp]:
 def _near_a_value(known: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """(T, S), whether a value is known at most :data:`_FARTHEST_FRAMES` away."""
     padded = np.pad(known, ((_FARTHEST_FRAMES, _FARTHEST_FRAMES), (0, 0)))
-    return np.lib.stride_tricks.sliding_window_view(padded, 2 * _FARTHEST_FRAMES + 1, axis=0).any(-1)
+    return np.asarray(np.lib.stride_tricks.sliding_window_view(padded, 2 * _FARTHEST_FRAMES + 1, axis=0).any(-1))
 
 
 def on_sphere(base: Array) -> Neighbours:
-    """Unit vectors (..., T, S, 3) of other frames as tangents of the sphere at the unit vectors ``base`` (T, S, 3) of each frame.
+    """Unit vectors (..., T, S, 3) of other frames as tangents of the sphere at ``base`` (T, S, 3) of each frame.
 
     In these coordinates a direction that turns evenly is a straight line, which a polynomial follows without bending it.
     """

@@ -38,8 +38,8 @@ class StickMotion:
 class StickSmoother:
     """A stick as its middle and its direction: the middle is smoothed in space, the direction on the sphere.
 
-    The ends of a swung stick move on small circles, whose chords are shorter than their arcs. The direction turns evenly and can
-    be averaged over more frames without bias. The length is the given one.
+    The ends of a swung stick move on small circles, whose chords are shorter than their arcs. The direction turns evenly and
+    can be averaged over more frames without bias. The length is the given one.
     """
 
     ends: tuple[int, int]
@@ -69,7 +69,8 @@ class StickSmoother:
         direction, rate = from_sphere(self.base, *self.direction(_direction(ends)[:, :, None]))
         half = 0.5 * lengths_m[:, None, None, None]
         parts = middle - half * direction, middle + half * direction, velocity - half * rate, velocity + half * rate
-        return StickMotion(*(part[:, :, 0] for part in parts), np.linalg.norm(rate[:, :, 0], axis=-1))
+        start, tip, start_velocity, tip_velocity = (part[:, :, 0] for part in parts)
+        return StickMotion(start, tip, start_velocity, tip_velocity, np.linalg.norm(rate[:, :, 0], axis=-1))
 
 
 def _direction(ends: Array) -> Array:

@@ -164,8 +164,8 @@ def _vertical(rotations: Tensor, up: Sequence[float] | None) -> tuple[Array | No
     mean_up = -rotations[:, 1].mean(0)
     if tilt > _LEVEL_SINE or second < 2 * _LEVEL_SINE or abs(float(candidate @ mean_up)) < 0.5:
         return None, [
-            "The vertical is not known, because the cameras do not stand level or look in one direction. Angles that need it are "
-            "left out. Give it as `up`."
+            "The vertical is not known, because the cameras do not stand level or look in one direction. Angles that need it "
+            "are left out. Give it as `up`."
         ]
     sign = 1.0 if float(candidate @ mean_up) > 0 else -1.0
     return (sign * candidate).numpy(), [
@@ -176,7 +176,7 @@ def _vertical(rotations: Tensor, up: Sequence[float] | None) -> tuple[Array | No
 
 def _roots(covariances: Array) -> Array:
     """Symmetric square roots of covariances (..., n, n); NaN where a covariance is NaN."""
-    known = np.isfinite(covariances).all((-2, -1))
+    known = np.asarray(np.isfinite(covariances).all((-2, -1)))
     values, vectors = np.linalg.eigh(np.where(known[..., None, None], covariances, 0.0))
     roots = (vectors * np.sqrt(np.maximum(values, 0.0))[..., None, :]) @ np.swapaxes(vectors, -1, -2)
     return np.where(known[..., None, None], roots, np.nan)

@@ -16,8 +16,8 @@ def add_analyse(commands: Any) -> None:
     command = commands.add_parser(
         "analyse",
         help="joint angles, stick kinematics and phases of the swings of a calibrated session",
-        description="Joint angles, stick kinematics, phases and repeated swings of a calibrated session, each with its standard "
-        "deviation.",
+        description="Joint angles, stick kinematics, phases and repeated swings of a calibrated session, with their "
+        "standard deviations.",
     )
     add = command.add_argument
     add("calibration", metavar="DIR", type=Path, help=f"folder that `calibrate` wrote, or its {POINTS_FILE}")
