@@ -39,7 +39,7 @@ FLOORS = [
     ["layer"],
     ["show"],
     ["io"],
-    ["analysis"],
+    ["analysis", "video"],
     ["simulate"],
     ["benchmark.baselines"],
     ["benchmark"],

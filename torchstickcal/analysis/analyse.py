@@ -246,9 +246,10 @@ def _figures(
         found["plane_slope"] = (float(np.degrees(np.arccos(np.clip(abs(normal @ tracks.up), 0, 1)))), "deg")
         found["attack_angle"] = (float(np.degrees(np.arcsin(velocity @ tracks.up / np.linalg.norm(velocity)))), "deg")
     for name in ("x_factor", "x_factor_projected"):
-        part = curves[name][number][(times >= takeaway) & (times <= impact)] if name in curves else np.array([np.nan])
-        if np.isfinite(part).any():
-            found[f"largest_{name}"] = (float(part[np.nanargmax(np.abs(part))]), "deg")
+        if name in curves:
+            part = curves[name][number][(times >= takeaway) & (times <= impact)]
+            largest = float(part[np.nanargmax(np.abs(part))]) if np.isfinite(part).any() else np.nan
+            found[f"largest_{name}"] = (largest, "deg")
     return found
 
 

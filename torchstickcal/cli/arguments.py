@@ -9,6 +9,7 @@ from typing import Any, NoReturn
 from torchstickcal.cli.analyse import add_analyse
 from torchstickcal.cli.benchmark import benchmark
 from torchstickcal.cli.calibrate import calibrate_session
+from torchstickcal.cli.detect import add_detect
 from torchstickcal.cli.evaluate import evaluate
 from torchstickcal.cli.listing import LISTS, list_names
 from torchstickcal.cli.outputs import EXIT_UNUSABLE
@@ -34,7 +35,7 @@ def parser() -> argparse.ArgumentParser:
         description="Calibrate a camera rig, in metres, from an athlete's keypoints and a stick of known length.",
     )
     commands = parser.add_subparsers(metavar="COMMAND", required=True)
-    for add in (_add_calibrate, add_analyse, _add_evaluate, _add_benchmark, _add_simulate, _add_demo, _add_list):
+    for add in (_add_calibrate, add_detect, add_analyse, _add_evaluate, _add_benchmark, _add_simulate, _add_demo, _add_list):
         add(commands)
     return parser
 
