@@ -12,7 +12,6 @@ import csv
 import json
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from itertools import count
 from pathlib import Path
 from typing import Any
 
@@ -24,7 +23,7 @@ from torchstickcal.files import atomic_set, json_text
 from torchstickcal.io.skeletons import skeleton as skeleton_named
 from torchstickcal.io.skeletons import skeletons_of
 from torchstickcal.untrusted import read_json
-from torchstickcal.video.frames import VideoInfo, frame_numbers, frames_of, video_info
+from torchstickcal.video.frames import VideoInfo, frame_numbers, frames_at, frames_of, video_info
 from torchstickcal.video.pose import BodyDetector
 from torchstickcal.video.tape import Background, TapeTrack, candidates, check_colours, learned, sampled
 
@@ -161,8 +160,7 @@ def detect(
 
 def _background(path: str | Path, info: VideoInfo, tapes: Sequence[str]) -> Background:
     frames = info.frames or sum(1 for _ in frames_of(path))
-    wanted = set(sampled(frames))
-    return learned((image for number, (_, image) in zip(count(), frames_of(path)) if number in wanted), tapes)
+    return learned(frames_at(path, set(sampled(frames))), tapes)
 
 
 def _names(points: int, skeleton: str | None) -> tuple[str, ...]:

@@ -78,6 +78,18 @@ def frames_of(path: str | Path) -> Iterator[tuple[float, Image]]:
         raise _unreadable(path, "no frame")
 
 
+def frames_at(path: str | Path, numbers: set[int]) -> Iterator[Image]:
+    """The images of some frames of a video, counted from 0; errors as of :func:`frames_of`."""
+    capture, number = _opened(path), 0
+    try:
+        while number <= max(numbers, default=-1) and capture.grab():
+            if number in numbers:
+                yield np.asarray(capture.retrieve()[1], dtype=np.uint8)
+            number += 1
+    finally:
+        capture.release()
+
+
 def frame_numbers(times: NDArray[np.float64]) -> tuple[NDArray[np.int64], float]:
     """Numbers of frames that leave out those that were dropped, and the frame rate, from the times (F,) of the frames.
 

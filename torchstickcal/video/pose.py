@@ -101,7 +101,7 @@ def _decoded(along_x: Array, along_y: Array, scale: float, corner: Array) -> Arr
 
 
 class RtmlibModel:
-    """RTMLib's detector of body and feet (halpe-26), which keeps its weights in a cache of its own and loads them when first used.
+    """RTMLib's detector of body and feet (halpe-26). It keeps its weights in a cache of its own, loaded when first used.
 
     The largest person of each image is taken.
 
@@ -120,10 +120,9 @@ class RtmlibModel:
         """Keypoints (26, 3): x and y in pixels, and a score."""
         keypoints, scores = self._model(image)
         found = np.concatenate([np.asarray(keypoints, float), np.asarray(scores, float)[..., None]], axis=-1)
-        extent = [
-            np.prod(np.ptp(person[person[:, 2] >= _LEAST_SCORE][:, :2], axis=0)) if len(person) else 0 for person in found
-        ]
-        return found[int(np.argmax(extent))] if len(found) else np.full((26, 3), [np.nan, np.nan, 0.0])
+        if not len(found):
+            return np.full((26, 3), [np.nan, np.nan, 0.0])
+        return max(found, key=lambda person: float(np.ptp(person[:, :2], axis=0).prod()))
 
 
 def _session(path: str | Path) -> Any:

@@ -1,9 +1,9 @@
 """Ends of a stick that are marked with coloured tape or balls, found in the frames of a camera that stands still.
 
-A frame is compared with the background. Where a marker covers a share of a pixel's exposure, the pixel is the mixture of marker
-and background by that share: the shares are found by linear unmixing. Their centre of mass is the centre of the marker, and that
-of a streak of motion blur is where the marker was in the middle of the exposure. Their sum is the area of the marker whatever the
-blur, so that a marker that is partly hidden is noticed. An end is left out rather than guessed.
+A frame is compared with the background. Where a marker covers a share of a pixel's exposure, the pixel is the mixture of
+marker and background by that share: the shares are found by linear unmixing. Their centre of mass is the centre of the marker,
+and that of a streak of motion blur is where the marker was in the middle of the exposure. Their sum is the area of the marker
+whatever the blur, so that a marker that is partly hidden is noticed. An end is left out rather than guessed.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ _RIVAL = 0.4
 _NEIGHBOURS = 4
 _JUMP_PX = 6.0
 _JUMP_SHARE = 0.35
-_SAMPLES = 40
+_SAMPLES = 21
 
 
 @dataclass(frozen=True)
@@ -82,7 +82,7 @@ def learned(frames: Iterable[Image], names: Sequence[str]) -> Background:
     """The background and the colours, from frames spread over a video: the median, and what moves in front of it.
 
     Args:
-        frames: about 40 images of one size.
+        frames: about 20 images of one size.
         names: of colours, keys of :data:`HUES`.
     """
     images = np.stack(list(frames))
@@ -107,8 +107,12 @@ def candidates(image: Image, background: Background, name: str) -> list[Candidat
     colour = background.colours[name]
     if colour is None:
         return []
-    change = image.astype(np.float32) - background.image
-    towards = colour - background.image
+    box = _changed_box(image, background.image)
+    if box is None:
+        return []
+    behind = background.image[box]
+    change = image[box].astype(np.float32) - behind
+    towards = colour - behind
     size = np.maximum(np.einsum("hwc,hwc->hw", towards, towards), 1.0)
     share = np.einsum("hwc,hwc->hw", change, towards) / size
     rest = np.linalg.norm(change - share[..., None] * towards, axis=-1)
@@ -127,12 +131,14 @@ def candidates(image: Image, background: Background, name: str) -> list[Candidat
             0, 1.1
         )
         area = float(weights.sum())
-        if area < _LEAST_AREA_PX or _touches_border(left, top, width, height, fits.shape):
+        whole = left + box[1].start, top + box[0].start
+        if area < _LEAST_AREA_PX or _touches_border(*whole, width, height, image.shape):
             continue
         ys, xs = np.mgrid[grown]
         x, y = float((weights * xs).sum() / area), float((weights * ys).sum() / area)
         spread = np.cov(np.stack([xs.ravel(), ys.ravel()]), aweights=weights.ravel() + 1e-12)
-        found.append(Candidate(x, y, area, float(np.sqrt(12 * np.linalg.eigvalsh(spread)[-1]))))
+        streak = float(np.sqrt(12 * np.linalg.eigvalsh(spread)[-1]))
+        found.append(Candidate(x + box[1].start, y + box[0].start, area, streak))
     return sorted(found, key=lambda candidate: -candidate.area_px)
 
 
@@ -170,6 +176,20 @@ def _of_hue(image: Image, name: str) -> NDArray[np.bool_]:
 
 def _changed(image: Image, background: NDArray[np.float32]) -> NDArray[np.bool_]:
     return np.asarray(np.abs(image.astype(np.float32) - background).max(-1) > 3 * _LEAST_CHANGE)
+
+
+def _changed_box(image: Image, background: NDArray[np.float32]) -> tuple[slice, slice] | None:
+    """Rows and columns that hold everything that differs from the background; None if nothing does."""
+    apart = cv2.absdiff(image, background.round().clip(0, 255).astype(np.uint8)).max(-1)
+    changed = cv2.blur(apart, (3, 3)) > 0.5 * _LEAST_CHANGE
+    rows, columns = (np.flatnonzero(changed.any(axis)) for axis in (1, 0))
+    if not len(rows):
+        return None
+    margin = 4
+    return (
+        slice(max(0, int(rows[0]) - margin), int(rows[-1]) + margin + 1),
+        slice(max(0, int(columns[0]) - margin), int(columns[-1]) + margin + 1),
+    )
 
 
 def _touches_border(left: int, top: int, width: int, height: int, shape: tuple[int, ...]) -> bool:
