@@ -3,9 +3,9 @@
     python examples/from_video_to_swing.py --sessions 4 --seconds 1.2 --fps 120
 
 Four cameras of 1280 x 720 film an athlete whose stick carries two pieces of tape: with motion blur, noise, and a cluttered
-background that has things of the tape's colours too. The videos are written with OpenCV and read again. The body is drawn without
-a face or clothes, which no pose network knows: body keypoints are the true ones with errors of 3 px. The same session is also
-calibrated with perfect keypoints of the tape.
+background that has things of the tape's colours too. The videos are written with OpenCV and read again. The body is drawn
+without a face or clothes, which no pose network knows: body keypoints are the true ones with errors of 3 px. The same session is
+also calibrated with perfect keypoints of the tape.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ from torchstickcal.video import detect
 Array = NDArray[np.float64]
 
 SPORTS = ("golf", "baseball", "hockey", "kendo")
-BEGIN_S = {"golf": 0.75, "baseball": 0.75, "hockey": 1.6, "kendo": 0.6}
+BEGIN_S = {"golf": 1.1, "baseball": 1.0, "hockey": 1.85, "kendo": 0.85}
 """When the fast part of the swing begins"""
 CAMERAS, SIZE = 4, (1280, 720)
 WRONG_PX = 5.0

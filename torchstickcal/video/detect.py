@@ -23,9 +23,9 @@ from torchstickcal.files import atomic_set, json_text
 from torchstickcal.io.skeletons import skeleton as skeleton_named
 from torchstickcal.io.skeletons import skeletons_of
 from torchstickcal.untrusted import read_json
-from torchstickcal.video.frames import VideoInfo, frame_numbers, frames_at, frames_of, video_info
+from torchstickcal.video.frames import frame_numbers, frames_at, frames_of, video_info
 from torchstickcal.video.pose import BodyDetector
-from torchstickcal.video.tape import Background, TapeTrack, candidates, check_colours, learned, sampled
+from torchstickcal.video.tape import TapeTrack, candidates, check_colours, learned, sampled
 
 Array = NDArray[np.float64]
 Progress = Callable[[str, int, int], None]
@@ -86,25 +86,18 @@ def detect_video(
     if tapes:
         check_colours(tapes)
     info = video_info(path)
-    background = _background(path, info, tapes) if tapes else None
-    tracks = {name: TapeTrack() for name in tapes}
     times: list[float] = []
     people: list[Array] = []
-    names: tuple[str, ...] = ()
     for time_s, image in frames_of(path):
         times.append(time_s)
         if body is not None:
             people.append(np.asarray(body(image), dtype=np.float64))
-            names = names or _names(len(people[-1]), skeleton)
-        for number, (name, track) in enumerate(tracks.items()):
-            assert background is not None
-            reach = _HAND_REACH if number == 0 else _STICK_REACH
-            track.add(candidates(image, background, name), _near_hands(people[-1], names, reach) if people else None)
         if progress is not None:
             progress(camera, len(times), info.frames)
+    names = _names(len(people[0]), skeleton) if people else ()
     numbers, fps = frame_numbers(np.array(times))
     parts = [np.stack(people)] if people else []
-    parts += [track.ends()[:, None] for track in tracks.values()]
+    parts += [ends[:, None] for ends in _tape_ends(path, len(times), tapes, people, names)]
     points = (*names, *(f"tape_{name}" for name in tapes))
     return VideoKeypoints(camera, numbers, np.array(times), fps, info.size, points, np.concatenate(parts, axis=1))
 
@@ -158,9 +151,21 @@ def detect(
     return notes
 
 
-def _background(path: str | Path, info: VideoInfo, tapes: Sequence[str]) -> Background:
-    frames = info.frames or sum(1 for _ in frames_of(path))
-    return learned(frames_at(path, set(sampled(frames))), tapes)
+def _tape_ends(
+    path: str | Path, frames: int, tapes: Sequence[str], people: Sequence[Array], names: Sequence[str]
+) -> list[Array]:
+    """The marked ends (F, 3) of each colour."""
+    if not tapes:
+        return []
+    chosen = sampled(frames)
+    background = learned(frames_at(path, set(chosen)), tapes, [people[number] for number in chosen] if people else ())
+    tracks = [TapeTrack() for _ in tapes]
+    for frame, (_, image) in enumerate(frames_of(path)):
+        for number, (name, track) in enumerate(zip(tapes, tracks, strict=True)):
+            reach = _HAND_REACH if number == 0 else _STICK_REACH
+            near = _near_hands(people[frame], names, reach) if people else None
+            track.add(candidates(image, background, name, near), near)
+    return [track.ends() for track in tracks]
 
 
 def _names(points: int, skeleton: str | None) -> tuple[str, ...]:

@@ -33,15 +33,24 @@ _LEAST_CHANGE = 14.0
 """Difference from the background that is not noise, in steps of 256."""
 _UNEXPLAINED = 0.35
 """Largest part of a pixel's change, as a share of it, that mixing with the marker's colour does not explain."""
+_LEAST_CONTRAST = 40.0
+_ALIKE = (30.0, 90.0)
+"""Distances from the marker's colour at which a pixel is surely of the marker, and surely not."""
+_PURITY = 0.7
 _LEAST_AREA_PX = 6.0
 _AREA_RANGE = (0.65, 1.5)
 """Areas of a marker relative to its usual one; others are partly hidden, or two things in one."""
+_AREA_FRAMES = 6
+"""The usual area is the median over so many frames before and after: a marker that turns changes its area."""
 _RIVAL = 0.4
 """A second thing of that colour, of this share of the area of the first one, makes a frame ambiguous."""
 _NEIGHBOURS = 4
 _JUMP_PX = 6.0
 _JUMP_SHARE = 0.35
 _SAMPLES = 21
+_BODY_MARGIN = 0.1
+"""Reach of limbs around the body's keypoints, as a share of the diagonal of their box."""
+_LEAST_UNCOVERED = 3
 
 
 @dataclass(frozen=True)
@@ -78,15 +87,26 @@ def check_colours(names: Sequence[str]) -> None:
         )
 
 
-def learned(frames: Iterable[Image], names: Sequence[str]) -> Background:
+def learned(frames: Iterable[Image], names: Sequence[str], people: Sequence[Array | None] = ()) -> Background:
     """The background and the colours, from frames spread over a video: the median, and what moves in front of it.
+
+    An athlete who stands at one place for long would become part of the background. So pixels near the body do not count in a
+    frame, and where nothing else was ever seen, the background is not known and no marker is found.
 
     Args:
         frames: about 20 images of one size.
         names: of colours, keys of :data:`HUES`.
+        people: the body's keypoints (P, 3) in each of the frames; empty, or None in a frame, where they are not known.
     """
     images = np.stack(list(frames))
     background = np.median(images, axis=0).astype(np.float32)
+    covered = [_body_mask(person, images.shape[1:3]) for person in people]
+    nothing = np.zeros(images.shape[1:3], dtype=bool)
+    masks = np.stack([nothing if mask is None else mask for mask in covered] or [nothing])
+    if masks.any():
+        rows, columns = (np.flatnonzero(masks.any((0, axis))) for axis in (2, 1))
+        box = slice(int(rows[0]), int(rows[-1]) + 1), slice(int(columns[0]), int(columns[-1]) + 1)
+        background[box] = _median_of_uncovered(images[:, *box], masks[:, *box])
     colours: dict[str, NDArray[np.float32] | None] = dict.fromkeys(names)
     for name in names:
         pixels = [image[_of_hue(image, name) & _changed(image, background)] for image in images]
@@ -97,49 +117,113 @@ def learned(frames: Iterable[Image], names: Sequence[str]) -> Background:
     return Background(background, colours)
 
 
+def _body_mask(person: Array | None, shape: tuple[int, ...]) -> NDArray[np.bool_] | None:
+    """The pixels near a body with keypoints (P, 3); None where it was not seen."""
+    if person is None:
+        return None
+    seen = person[(person[:, 2] > 0) & np.isfinite(person[:, :2]).all(-1), :2]
+    if len(seen) < 3:
+        return None
+    mask = np.zeros(shape, np.uint8)
+    cv2.fillConvexPoly(mask, cv2.convexHull(seen.round().astype(np.int32)), 1)
+    reach = max(3, round(_BODY_MARGIN * float(np.linalg.norm(np.ptp(seen, axis=0)))))
+    return cv2.dilate(mask, np.ones((2 * reach + 1, 2 * reach + 1), np.uint8)) > 0
+
+
+def _median_of_uncovered(images: NDArray[np.uint8], masks: NDArray[np.bool_]) -> NDArray[np.float32]:
+    """Medians (h, w, 3) over the images (n, h, w, 3) in which a pixel is not covered; NaN where it is in nearly all."""
+    values = np.where(masks[..., None], np.nan, images.astype(np.float32))
+    values.sort(axis=0)  # NaN last
+    count = (~masks).sum(0)
+    low = np.maximum(count - 1, 0) // 2
+    median = np.take_along_axis(values, low[None, ..., None], 0)[0]
+    return np.where((count >= _LEAST_UNCOVERED)[..., None], median, np.nan).astype(np.float32)
+
+
 def sampled(count: int) -> list[int]:
     """Numbers of the frames of a video of ``count`` frames from which the background is learned."""
     return sorted(set(np.linspace(0, max(count - 1, 0), min(_SAMPLES, max(count, 1))).round().astype(int).tolist()))
 
 
-def candidates(image: Image, background: Background, name: str) -> list[Candidate]:
-    """Everything in a frame that looks like the marker of a colour, the largest first."""
+def candidates(
+    image: Image, background: Background, name: str, near: tuple[float, float, float] | None = None
+) -> list[Candidate]:
+    """Everything in a frame that looks like the marker of a colour, the largest first.
+
+    Args:
+        image: the frame.
+        background: of :func:`learned`.
+        name: of the colour.
+        near: x, y and radius, pixels, of where to look; None for everywhere.
+    """
     colour = background.colours[name]
     if colour is None:
         return []
-    box = _changed_box(image, background.image)
-    if box is None:
-        return []
-    behind = background.image[box]
-    change = image[box].astype(np.float32) - behind
-    towards = colour - behind
-    size = np.maximum(np.einsum("hwc,hwc->hw", towards, towards), 1.0)
-    share = np.einsum("hwc,hwc->hw", change, towards) / size
-    rest = np.linalg.norm(change - share[..., None] * towards, axis=-1)
-    length = np.linalg.norm(change, axis=-1)
-    fits = (share > _LEAST_SHARE) & (length > _LEAST_CHANGE) & (rest < _UNEXPLAINED * length + 8.0) & (size > 40.0**2)
-    count, labels, boxes, _ = cv2.connectedComponentsWithStats(fits.astype(np.uint8), connectivity=8)
+    shares, corner = _shares(image, background.image, colour, near)
+    _, labels, boxes, _ = cv2.connectedComponentsWithStats((shares > _LEAST_SHARE).astype(np.uint8), connectivity=8)
     found = []
-    for label in range(1, count):
-        left, top, width, height, pixels = (int(v) for v in boxes[label])
+    for label, (left, top, width, height, pixels) in enumerate(boxes[1:].tolist(), 1):
         if pixels < _LEAST_AREA_PX / 2:
             continue
-        grown = slice(max(0, top - 2), top + height + 2), slice(max(0, left - 2), left + width + 2)
-        inside = cv2.dilate((labels[grown] == label).astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
-        other = (labels[grown] != label) & (labels[grown] != 0)
-        weights = np.where(inside & ~other & (rest[grown] < _UNEXPLAINED * length[grown] + 12.0), share[grown], 0.0).clip(
-            0, 1.1
-        )
+        part = slice(max(0, top - 1), top + height + 1), slice(max(0, left - 1), left + width + 1)
+        found += _markers_in(np.where(labels[part] == label, shares[part], 0.0), (part[1].start, part[0].start))
+    whole = [Candidate(c.x + corner[0], c.y + corner[1], c.area_px, c.streak_px) for c in found]
+    inside = [c for c in whole if _is_inside(c, image.shape)]
+    return sorted(inside, key=lambda candidate: -candidate.area_px)
+
+
+def _shares(
+    image: Image, background: NDArray[np.float32], colour: NDArray[np.float32], near: tuple[float, float, float] | None
+) -> tuple[NDArray[np.float32], tuple[int, int]]:
+    """Shares of a marker in the pixels of a part of an image (h, w), 0 where another thing explains them; and its corner.
+
+    Where the background is not known, a pixel is of the marker as far as it has its colour.
+    """
+    left, top, right, bottom = 0, 0, image.shape[1], image.shape[0]
+    if near is not None:
+        x, y, radius = near
+        left, top = max(0, int(x - radius)), max(0, int(y - radius))
+        right, bottom = min(right, int(x + radius) + 1), min(bottom, int(y + radius) + 1)
+    if right - left < 3 or bottom - top < 3:
+        return np.zeros((1, 1), np.float32), (0, 0)
+    part, behind = image[top:bottom, left:right], background[top:bottom, left:right]
+    apart = cv2.absdiff(part, np.nan_to_num(behind).round().astype(np.uint8)).max(-1)
+    rows, columns = np.nonzero((cv2.blur(apart, (3, 3)) > 0.7 * _LEAST_CHANGE) | np.isnan(behind[..., 0]))
+    pixels, behind = part[rows, columns].astype(np.float32), behind[rows, columns]
+    change, towards = pixels - behind, colour - behind
+    size = np.square(towards).sum(-1)
+    share = (change * towards).sum(-1) / np.maximum(size, 1.0)
+    rest, length = np.linalg.norm(change - share[:, None] * towards, axis=-1), np.linalg.norm(change, axis=-1)
+    fits = (length > _LEAST_CHANGE) & (rest < _UNEXPLAINED * length + _LEAST_CHANGE / 2) & (size > _LEAST_CONTRAST**2)
+    alike = 1 - (np.linalg.norm(pixels - colour, axis=-1) - _ALIKE[0]) / (_ALIKE[1] - _ALIKE[0])
+    shares = np.zeros(part.shape[:2], np.float32)
+    shares[rows, columns] = np.where(np.isnan(behind[:, 0]), alike, np.where(fits, share, 0.0)).clip(0, 1)
+    return shares, (left, top)
+
+
+def _markers_in(shares: NDArray[np.float32], corner: tuple[int, int]) -> list[Candidate]:
+    """Markers in connected pixels with shares (h, w): what is half as pure as the purest pixels belongs together.
+
+    A marker at rest covers pixels wholly. One that is blurred covers each of them for a shorter time the longer its streak is.
+    Something compact that is nowhere pure is another thing.
+    """
+    seen = shares[shares > 0]
+    peak = float(np.percentile(seen, 95))
+    count, labels = cv2.connectedComponents((shares > max(_LEAST_SHARE, 0.5 * peak)).astype(np.uint8), connectivity=8)
+    found = []
+    for label in range(1, count):
+        own = cv2.dilate((labels == label).astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
+        rows, columns = np.nonzero(own & ((labels == 0) | (labels == label)) & (shares > 0))
+        weights = shares[rows, columns].astype(np.float64)
         area = float(weights.sum())
-        whole = left + box[1].start, top + box[0].start
-        if area < _LEAST_AREA_PX or _touches_border(*whole, width, height, image.shape):
+        if area < _LEAST_AREA_PX:
             continue
-        ys, xs = np.mgrid[grown]
-        x, y = float((weights * xs).sum() / area), float((weights * ys).sum() / area)
-        spread = np.cov(np.stack([xs.ravel(), ys.ravel()]), aweights=weights.ravel() + 1e-12)
-        streak = float(np.sqrt(12 * np.linalg.eigvalsh(spread)[-1]))
-        found.append(Candidate(x + box[1].start, y + box[0].start, area, streak))
-    return sorted(found, key=lambda candidate: -candidate.area_px)
+        x, y = float(columns @ weights / area), float(rows @ weights / area)
+        spread = np.cov(np.stack([columns, rows]), aweights=weights)
+        width, length = np.sqrt(12 * np.maximum(np.linalg.eigvalsh(spread), 0.0)) + 1e-9
+        if peak >= _PURITY * min(1.0, width / max(length - width, 1e-9)):
+            found.append(Candidate(x + corner[0], y + corner[1], area, float(length)))
+    return found
 
 
 @dataclass(eq=False)
@@ -178,22 +262,10 @@ def _changed(image: Image, background: NDArray[np.float32]) -> NDArray[np.bool_]
     return np.asarray(np.abs(image.astype(np.float32) - background).max(-1) > 3 * _LEAST_CHANGE)
 
 
-def _changed_box(image: Image, background: NDArray[np.float32]) -> tuple[slice, slice] | None:
-    """Rows and columns that hold everything that differs from the background; None if nothing does."""
-    apart = cv2.absdiff(image, background.round().clip(0, 255).astype(np.uint8)).max(-1)
-    changed = cv2.blur(apart, (3, 3)) > 0.5 * _LEAST_CHANGE
-    rows, columns = (np.flatnonzero(changed.any(axis)) for axis in (1, 0))
-    if not len(rows):
-        return None
-    margin = 4
-    return (
-        slice(max(0, int(rows[0]) - margin), int(rows[-1]) + margin + 1),
-        slice(max(0, int(columns[0]) - margin), int(columns[-1]) + margin + 1),
-    )
-
-
-def _touches_border(left: int, top: int, width: int, height: int, shape: tuple[int, ...]) -> bool:
-    return left <= 1 or top <= 1 or left + width >= shape[1] - 1 or top + height >= shape[0] - 1
+def _is_inside(candidate: Candidate, shape: tuple[int, ...]) -> bool:
+    """Whether nothing of a candidate can be outside the image."""
+    reach = candidate.streak_px / 2 + 2
+    return reach < candidate.x < shape[1] - reach and reach < candidate.y < shape[0] - reach
 
 
 def _within(candidate: Candidate, near: tuple[float, float, float] | None) -> bool:
@@ -203,12 +275,12 @@ def _within(candidate: Candidate, near: tuple[float, float, float] | None) -> bo
 def _usual_areas(found: list[list[Candidate]]) -> Array:
     """(F,), the usual area of the marker around each frame: the median of the largest candidates of many frames."""
     largest = np.array([max((c.area_px for c in frame), default=np.nan) for frame in found])
-    reach, usual = 20, np.full(len(found), np.nan)
+    usual = np.full(len(found), np.nan)
     overall = float(np.nanmedian(largest)) if np.isfinite(largest).any() else np.nan
     for frame in range(len(found)):
-        around = largest[max(0, frame - reach) : frame + reach + 1]
-        around = around[np.isfinite(around) & (around > 0.4 * overall) & (around < 2.5 * overall)]
-        usual[frame] = np.median(around) if len(around) >= 5 else overall
+        around = largest[max(0, frame - _AREA_FRAMES) : frame + _AREA_FRAMES + 1]
+        around = around[np.isfinite(around)]
+        usual[frame] = np.median(around) if len(around) >= _AREA_FRAMES else overall
     return usual
 
 
