@@ -285,18 +285,27 @@ def _usual_areas(found: list[list[Candidate]]) -> Array:
 
 
 def _without_jumps(ends: Array) -> Array:
-    """Ends (F, 3) without those that do not follow from their neighbours: a parabola through them predicts each one."""
+    """Ends (F, 3) without those that do not follow from their neighbours, the most surprising of neighbours first."""
     kept = ends.copy()
-    known = np.isfinite(ends[:, 0])
-    for frame in np.flatnonzero(known):
-        around = np.arange(max(0, frame - _NEIGHBOURS), min(len(ends), frame + _NEIGHBOURS + 1))
-        around = around[known[around] & (around != frame)]
-        if len(around) < 4 or not (around.min() < frame < around.max()):
-            if len(around) < 2:
-                kept[frame] = np.nan, np.nan, 0.0
-            continue
-        fit = np.polynomial.polynomial.polyfit(around - frame, ends[around, :2], 2)
-        speed = float(np.linalg.norm(fit[1]))
-        if np.linalg.norm(ends[frame, :2] - fit[0]) > _JUMP_PX + _JUMP_SHARE * speed:
-            kept[frame] = np.nan, np.nan, 0.0
+    surprise = np.array([_surprise(kept, frame) for frame in range(len(kept))])
+    while (surprise > 1).any():
+        around = [surprise[max(0, k - _NEIGHBOURS) : k + _NEIGHBOURS + 1].max() for k in range(len(kept))]
+        worst = np.flatnonzero((surprise > 1) & (surprise == around))
+        kept[worst] = np.nan, np.nan, 0.0
+        for frame in {n for k in worst for n in range(max(0, k - _NEIGHBOURS), min(len(kept), k + _NEIGHBOURS + 1))}:
+            surprise[frame] = _surprise(kept, frame)
     return kept
+
+
+def _surprise(ends: Array, frame: int) -> float:
+    """How far an end is from the parabola through its neighbours, over what is allowed; 2 where there are hardly any."""
+    known = np.isfinite(ends[:, 0])
+    if not known[frame]:
+        return 0.0
+    around = np.arange(max(0, frame - _NEIGHBOURS), min(len(ends), frame + _NEIGHBOURS + 1))
+    around = around[known[around] & (around != frame)]
+    if len(around) < 4 or not around.min() < frame < around.max():
+        return 0.0 if len(around) >= 2 else 2.0
+    fit = np.polynomial.polynomial.polyfit(around - frame, ends[around, :2], 2)
+    allowed = _JUMP_PX + _JUMP_SHARE * float(np.linalg.norm(fit[1]))
+    return float(np.linalg.norm(ends[frame, :2] - fit[0])) / allowed
