@@ -166,8 +166,8 @@ def main() -> None:
         speed = analyse(calibration, sport).curves["tip_speed"]
         fastest = int(session.speeds[:, 1].argmax())
         print(
-            f"{number} {sport}: ends in {known.mean():.0%} of the images, median error {np.median(apart[good]):.2f} px "
-            f"({np.median(apart[fast]) if fast.any() else np.nan:.2f} px where fastest), {far.sum()} wrong of {known.sum()}, "
+            f"{number} {sport}: ends in {known.mean():.0%} of the images, median {np.median(apart[good]):.2f} px "
+            f"({np.median(apart[fast]) if fast.any() else 0:.2f} px if fast), {far.sum()} of {known.sum()} wrong; "
             f"fastest {session.speeds.max():.1f} m/s ({streak.max():.0f} px of blur); cameras {mm:.1f} mm, "
             f"with ideal ends {ideal_mm:.1f} mm; tape's speed found {speed.values[fastest]:.1f} +- {speed.std[fastest]:.1f} m/s",
             flush=True,
