@@ -244,6 +244,8 @@ def main() -> None:
     for name, parts in collected.items():
         values = np.concatenate(parts)
         size = np.abs(values[np.isfinite(values)])
+        if not len(size):
+            continue
         within = f"  within 1 frame: {100 * (size <= 1).sum() / len(values):.0f} %" if "frames" in name else ""
         print(f"{name:40}{rms(values):8.3f}{np.median(size):8.3f}{np.percentile(size, 95):8.3f}{within}")
 

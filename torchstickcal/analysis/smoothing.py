@@ -29,6 +29,8 @@ _LONGER_DRAWS = slice(1, None, 4)
 _STEADY_FRAMES = 2
 """The window of a frame is the median over so many frames before and after it."""
 _LEAST_CONDITION = 1e-7
+_LARGEST_SLOPE_GAIN = 1.5 * 1588 / 6048
+"""1.5 times the variance, per frame squared, of the slope of a cubic polynomial through seven frames with errors of 1."""
 
 
 def shifted(values: Array, offset: int) -> Array:
@@ -118,6 +120,8 @@ def smoother(times: Array, values: Array, variances: Array, neighbours: Neighbou
     sums = np.zeros((frames, count, _ORDER + 1, values.shape[-1]))
     tried: list[tuple[Array, Array, Array]] = []
     widths = [width for width in HALF_WIDTHS if width <= reach]
+    with np.errstate(invalid="ignore", divide="ignore"):
+        typical = np.nanmedian(np.where(inverse > 0, 1 / inverse, np.nan), axis=0, keepdims=True)
     before = -1
     for width in widths:
         for distance in range(before + 1, width + 1):
@@ -126,10 +130,11 @@ def smoother(times: Array, values: Array, variances: Array, neighbours: Neighbou
                 moments += weighted[..., :, None] * powers[number][..., None, :]
                 sums += weighted[..., :, None] * np.nan_to_num(near[number])[..., None, :]
         before = width
-        covariance = _inverse(moments)
+        covariance = _sure(_inverse(moments), typical)
         estimate = covariance[..., :2, :] @ sums
         tried.append((covariance[..., :2, :], estimate, np.diagonal(covariance, axis1=-2, axis2=-1)[..., :2]))
-    chosen = _steady(_longest(tried, widths))
+    determined = np.stack([np.isfinite(variance).all(-1) for _, _, variance in tried])
+    chosen = _determined_from(_steady(_longest(tried, widths)), determined)
     rows_of = np.stack([rows for rows, _, _ in tried])
     near_a_value = _near_a_value(inverse > 0)
 
@@ -141,7 +146,9 @@ def smoother(times: Array, values: Array, variances: Array, neighbours: Neighbou
             weights[k] = np.where((np.abs(offset) <= np.array(widths)[number])[..., None], linear / [1.0, step], 0.0)
         return np.where((np.isfinite(rows).all((-2, -1)) & near_a_value)[..., None], np.nan_to_num(weights), np.nan)
 
-    return Smoother(weights_of(chosen), weights_of(np.minimum(chosen + 1, len(widths) - 1)), neighbours)
+    return Smoother(
+        weights_of(chosen), weights_of(_determined_from(np.minimum(chosen + 1, len(widths) - 1), determined)), neighbours
+    )
 
 
 def _inverse(moments: Array) -> Array:
@@ -152,6 +159,19 @@ def _inverse(moments: Array) -> Array:
     safe = np.where(determined[..., None, None], scaled, np.eye(moments.shape[-1]))
     inverse = np.linalg.inv(safe) / scale[..., :, None] / scale[..., None, :]
     return np.where(determined[..., None, None], inverse, np.nan)
+
+
+def _sure(covariance: Array, typical: Array) -> Array:
+    """Covariances (T, S, n, n), NaN where velocities are less sure than in the middle of the shortest window.
+
+    At the ends of a recording and beside gaps, a polynomial through few frames on one side would say nothing of the velocity.
+
+    Args:
+        covariance: of the polynomials.
+        typical: (1, S), variances of single frames.
+    """
+    sure = covariance[..., 1, 1] <= _LARGEST_SLOPE_GAIN * typical
+    return np.where(sure[..., None, None], covariance, np.nan)
 
 
 def _longest(tried: list[tuple[Array, Array, Array]], widths: list[int]) -> NDArray[np.intp]:
@@ -168,6 +188,12 @@ def _longest(tried: list[tuple[Array, Array, Array]], widths: list[int]) -> NDAr
         going_on &= agrees | ~determined
         chosen = np.where(determined & (going_on | (chosen < 0)), number, chosen)
     return np.maximum(chosen, 0)
+
+
+def _determined_from(chosen: NDArray[np.intp], determined: NDArray[np.bool_]) -> NDArray[np.intp]:
+    """The shortest determined windows that are not shorter than the chosen ones (T, S), else the chosen ones."""
+    allowed = determined & (np.arange(len(determined))[:, None, None] >= chosen)
+    return np.where(allowed.any(0), allowed.argmax(0), chosen)
 
 
 def _mean_around(values: Array, reach: int) -> Array:
