@@ -166,10 +166,10 @@ def main() -> None:
         speed = analyse(calibration, sport).curves["tip_speed"]
         fastest = int(session.speeds[:, 1].argmax())
         print(
-            f"{number} {sport}: ends in {known.mean():.0%} of the images, median {np.median(apart[good]):.2f} px "
-            f"({np.median(apart[fast]) if fast.any() else 0:.2f} px if fast), {far.sum()} of {known.sum()} wrong; "
+            f"{number} {sport}: ends in {known.mean():.0%} of images, median {np.median(apart[good]):.2f} px "
+            f"({np.median(apart[fast]) if fast.any() else 0:.2f} px if fast), {far.sum()} of {known.sum()} wrong, "
             f"fastest {session.speeds.max():.1f} m/s ({streak.max():.0f} px of blur); cameras {mm:.1f} mm, "
-            f"with ideal ends {ideal_mm:.1f} mm; tape's speed found {speed.values[fastest]:.1f} +- {speed.std[fastest]:.1f} m/s",
+            f"with ideal ends {ideal_mm:.1f} mm; speed found {speed.values[fastest]:.1f} +- {speed.std[fastest]:.1f} m/s",
             flush=True,
         )
     mean, ideal_mean = np.sqrt(np.square(ratios).mean(0))

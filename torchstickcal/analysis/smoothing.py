@@ -22,8 +22,8 @@ HALF_WIDTHS = (3, 4, 5, 6, 8, 10, 13, 16, 20, 25, 32, 40)
 _ORDER = 3
 _AGREEMENT = 1.4
 """How many standard deviations, root mean square over the axes, estimates may differ by chance."""
-_FARTHEST_FRAMES = 3
-"""How far from a frame in which a point is known it is still estimated."""
+_FARTHEST_FRAMES, _FARTHEST_S = 3, 0.025
+"""How far from a frame in which a point is known it is still estimated; the larger of both."""
 _LONGER_DRAWS = slice(1, None, 4)
 """Which draws, after the estimate, are smoothed over the next longer windows."""
 _STEADY_FRAMES = 2
@@ -136,7 +136,7 @@ def smoother(times: Array, values: Array, variances: Array, neighbours: Neighbou
     determined = np.stack([np.isfinite(variance).all(-1) for _, _, variance in tried])
     chosen = _determined_from(_steady(_longest(tried, widths)), determined)
     rows_of = np.stack([rows for rows, _, _ in tried])
-    near_a_value = _near_a_value(inverse > 0)
+    near_a_value = _near_a_value(inverse > 0, max(_FARTHEST_FRAMES, round(_FARTHEST_S / step)))
 
     def weights_of(number: NDArray[np.intp]) -> Array:
         rows = np.take_along_axis(rows_of, number[None, ..., None, None], 0)[0]
@@ -213,10 +213,10 @@ def _steady(chosen: NDArray[np.intp]) -> NDArray[np.intp]:
     return np.median(windows, axis=-1).astype(np.intp)
 
 
-def _near_a_value(known: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """(T, S), whether a value is known at most :data:`_FARTHEST_FRAMES` away."""
-    padded = np.pad(known, ((_FARTHEST_FRAMES, _FARTHEST_FRAMES), (0, 0)))
-    return np.asarray(np.lib.stride_tricks.sliding_window_view(padded, 2 * _FARTHEST_FRAMES + 1, axis=0).any(-1))
+def _near_a_value(known: NDArray[np.bool_], reach: int) -> NDArray[np.bool_]:
+    """(T, S), whether a value is known at most ``reach`` frames away."""
+    padded = np.pad(known, ((reach, reach), (0, 0)))
+    return np.asarray(np.lib.stride_tricks.sliding_window_view(padded, 2 * reach + 1, axis=0).any(-1))
 
 
 def on_sphere(base: Array) -> Neighbours:

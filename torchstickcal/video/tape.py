@@ -34,8 +34,6 @@ _LEAST_CHANGE = 14.0
 _UNEXPLAINED = 0.35
 """Largest part of a pixel's change, as a share of it, that mixing with the marker's colour does not explain."""
 _LEAST_CONTRAST = 40.0
-_ALIKE = (30.0, 90.0)
-"""Distances from the marker's colour at which a pixel is surely of the marker, and surely not."""
 _PURITY = 0.7
 _LEAST_AREA_PX = 6.0
 _AREA_RANGE = (0.65, 1.5)
@@ -159,14 +157,15 @@ def candidates(
     colour = background.colours[name]
     if colour is None:
         return []
-    shares, corner = _shares(image, background.image, colour, near)
+    shares, unknown, corner = _shares(image, background.image, colour, near)
     _, labels, boxes, _ = cv2.connectedComponentsWithStats((shares > _LEAST_SHARE).astype(np.uint8), connectivity=8)
     found = []
     for label, (left, top, width, height, pixels) in enumerate(boxes[1:].tolist(), 1):
         if pixels < _LEAST_AREA_PX / 2:
             continue
         part = slice(max(0, top - 1), top + height + 1), slice(max(0, left - 1), left + width + 1)
-        found += _markers_in(np.where(labels[part] == label, shares[part], 0.0), (part[1].start, part[0].start))
+        own = np.where(labels[part] == label, shares[part], 0.0)
+        found += _markers_in(own, unknown[part], (part[1].start, part[0].start))
     whole = [Candidate(c.x + corner[0], c.y + corner[1], c.area_px, c.streak_px) for c in found]
     inside = [c for c in whole if _is_inside(c, image.shape)]
     return sorted(inside, key=lambda candidate: -candidate.area_px)
@@ -174,10 +173,9 @@ def candidates(
 
 def _shares(
     image: Image, background: NDArray[np.float32], colour: NDArray[np.float32], near: tuple[float, float, float] | None
-) -> tuple[NDArray[np.float32], tuple[int, int]]:
-    """Shares of a marker in the pixels of a part of an image (h, w), 0 where another thing explains them; and its corner.
-
-    Where the background is not known, a pixel is of the marker as far as it has its colour.
+) -> tuple[NDArray[np.float32], NDArray[np.bool_], tuple[int, int]]:
+    """Of a part of an image: shares of a marker in its pixels (h, w), 0 where another thing explains them; where the background
+    is not known, (h, w); and the corner of the part.
     """
     left, top, right, bottom = 0, 0, image.shape[1], image.shape[0]
     if near is not None:
@@ -185,27 +183,27 @@ def _shares(
         left, top = max(0, int(x - radius)), max(0, int(y - radius))
         right, bottom = min(right, int(x + radius) + 1), min(bottom, int(y + radius) + 1)
     if right - left < 3 or bottom - top < 3:
-        return np.zeros((1, 1), np.float32), (0, 0)
+        return np.zeros((1, 1), np.float32), np.zeros((1, 1), bool), (0, 0)
     part, behind = image[top:bottom, left:right], background[top:bottom, left:right]
     apart = cv2.absdiff(part, np.nan_to_num(behind).round().astype(np.uint8)).max(-1)
-    rows, columns = np.nonzero((cv2.blur(apart, (3, 3)) > 0.7 * _LEAST_CHANGE) | np.isnan(behind[..., 0]))
+    unknown = np.isnan(behind[..., 0])
+    rows, columns = np.nonzero((cv2.blur(apart, (3, 3)) > 0.7 * _LEAST_CHANGE) & ~unknown)
     pixels, behind = part[rows, columns].astype(np.float32), behind[rows, columns]
     change, towards = pixels - behind, colour - behind
     size = np.square(towards).sum(-1)
     share = (change * towards).sum(-1) / np.maximum(size, 1.0)
     rest, length = np.linalg.norm(change - share[:, None] * towards, axis=-1), np.linalg.norm(change, axis=-1)
     fits = (length > _LEAST_CHANGE) & (rest < _UNEXPLAINED * length + _LEAST_CHANGE / 2) & (size > _LEAST_CONTRAST**2)
-    alike = 1 - (np.linalg.norm(pixels - colour, axis=-1) - _ALIKE[0]) / (_ALIKE[1] - _ALIKE[0])
     shares = np.zeros(part.shape[:2], np.float32)
-    shares[rows, columns] = np.where(np.isnan(behind[:, 0]), alike, np.where(fits, share, 0.0)).clip(0, 1)
-    return shares, (left, top)
+    shares[rows, columns] = np.where(fits, share, 0.0).clip(0, 1)
+    return shares, unknown, (left, top)
 
 
-def _markers_in(shares: NDArray[np.float32], corner: tuple[int, int]) -> list[Candidate]:
+def _markers_in(shares: NDArray[np.float32], unknown: NDArray[np.bool_], corner: tuple[int, int]) -> list[Candidate]:
     """Markers in connected pixels with shares (h, w): what is half as pure as the purest pixels belongs together.
 
     A marker at rest covers pixels wholly. One that is blurred covers each of them for a shorter time the longer its streak is.
-    Something compact that is nowhere pure is another thing.
+    Something compact that is nowhere pure is another thing. What touches an unknown background may be only a part of a marker.
     """
     seen = shares[shares > 0]
     peak = float(np.percentile(seen, 95))
@@ -213,6 +211,8 @@ def _markers_in(shares: NDArray[np.float32], corner: tuple[int, int]) -> list[Ca
     found = []
     for label in range(1, count):
         own = cv2.dilate((labels == label).astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
+        if (own & unknown).any():
+            continue
         rows, columns = np.nonzero(own & ((labels == 0) | (labels == label)) & (shares > 0))
         weights = shares[rows, columns].astype(np.float64)
         area = float(weights.sum())
