@@ -28,6 +28,7 @@ _LONGER_DRAWS = slice(1, None, 4)
 """Which draws, after the estimate, are smoothed over the next longer windows."""
 _STEADY_FRAMES = 2
 """The window of a frame is the median over so many frames before and after it."""
+_FARTHEST_TURN_RAD = 1.75
 _LEAST_CONDITION = 1e-7
 _LARGEST_SLOPE_GAIN = 1.5 * 1588 / 6048
 """1.5 times the variance, per frame squared, of the slope of a cubic polynomial through seven frames with errors of 1."""
@@ -113,7 +114,10 @@ def smoother(times: Array, values: Array, variances: Array, neighbours: Neighbou
     at = [(shifted(times[:, None, None], offset) - times[:, None, None])[..., 0] / step for offset in offsets]
     near = [neighbours(values, offset) for offset in offsets]
     inverse = np.where(np.isfinite(values).all(-1) & np.isfinite(variances) & (variances > 0), 1 / variances, 0.0)
-    information = [np.nan_to_num(shifted(inverse[..., None], offset)[..., 0]) for offset in offsets]
+    information = [
+        np.where(np.isfinite(seen).all(-1), np.nan_to_num(shifted(inverse[..., None], offset)[..., 0]), 0.0)
+        for seen, offset in zip(near, offsets, strict=True)
+    ]
     powers = [np.nan_to_num(a[..., None] ** np.arange(_ORDER + 1)) for a in at]
 
     moments = np.zeros((frames, count, _ORDER + 1, _ORDER + 1))
@@ -220,13 +224,17 @@ def _near_a_value(known: NDArray[np.bool_], reach: int) -> NDArray[np.bool_]:
 
 
 def on_sphere(base: Array) -> Neighbours:
-    """Unit vectors (..., T, S, 3) of other frames as tangents of the sphere at ``base`` (T, S, 3) of each frame.
+    """Unit vectors (..., T, S, 3) of other frames as tangents of the sphere at each frame's ``base`` (T, S, 3).
 
-    In these coordinates a direction that turns evenly is a straight line, which a polynomial follows without bending it.
+    In these coordinates a direction that turns evenly is a straight line, which a polynomial follows without bending it. NaN
+    for frames up to which it has turned by more than 100 degrees.
     """
+    steps = np.nan_to_num(np.linalg.norm(np.diff(base, axis=0, prepend=base[:1]), axis=-1, keepdims=True))
+    arc = np.cumsum(2 * np.arcsin(np.clip(steps / 2, 0.0, 1.0)), axis=0)
 
     def seen(directions: Array, offset: int) -> Array:
-        there = shifted(directions, offset)
+        turned = np.abs(shifted(arc, offset) - arc) > _FARTHEST_TURN_RAD
+        there = np.where(turned, np.nan, shifted(directions, offset))
         cosine = np.clip((there * base).sum(-1, keepdims=True), -1.0, 1.0)
         aside = there - cosine * base
         sine = np.linalg.norm(aside, axis=-1, keepdims=True)

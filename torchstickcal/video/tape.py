@@ -40,6 +40,7 @@ _AREA_RANGE = (0.65, 1.5)
 """Areas of a marker relative to its usual one; others are partly hidden, or two things in one."""
 _AREA_FRAMES = 6
 """The usual area is the median over so many frames before and after: a marker that turns changes its area."""
+_LEAST_SCORE = 0.02
 _RIVAL = 0.4
 """A second thing of that colour, of this share of the area of the first one, makes a frame ambiguous."""
 _NEIGHBOURS = 4
@@ -241,14 +242,19 @@ class TapeTrack:
         self.near.append(near)
 
     def ends(self) -> Array:
-        """(F, 3): x and y in pixels, and a score; NaN, NaN, 0 where no end is sure."""
+        """(F, 3): x and y in pixels, and a score; NaN, NaN, 0 where no end is sure.
+
+        The score is lower where the marker is seen along the stick: its area is small, and the stick itself hides a part of it.
+        """
         allowed = [[c for c in found if _within(c, near)] for found, near in zip(self.found, self.near, strict=True)]
         usual = _usual_areas(allowed)
         ends = np.full((len(allowed), 3), [np.nan, np.nan, 0.0])
+        whole = float(np.nanpercentile(usual, 90)) if np.isfinite(usual).any() else np.nan
         for frame, (found, area) in enumerate(zip(allowed, usual, strict=True)):
             fitting = [c for c in found if _AREA_RANGE[0] * area <= c.area_px <= _AREA_RANGE[1] * area]
             if len(fitting) == 1 and not any(c.area_px >= _RIVAL * area for c in found if c is not fitting[0]):
-                ends[frame] = fitting[0].x, fitting[0].y, 1.0
+                score = np.clip((fitting[0].area_px / whole) ** 2, _LEAST_SCORE, 1.0)
+                ends[frame] = fitting[0].x, fitting[0].y, score
         return _without_jumps(ends)
 
 
