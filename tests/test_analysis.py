@@ -159,9 +159,12 @@ class TestSmoothing:
         direction = np.stack([np.cos(angle), np.sin(angle), 0 * angle], axis=-1)[:, None]
         smooth = smoother(times, direction, np.full((50, 1), 1e-4), on_sphere(direction))
         unit, rate = from_sphere(direction, *smooth(direction))
-        np.testing.assert_allclose(unit, direction, atol=1e-9)
-        np.testing.assert_allclose(np.linalg.norm(rate, axis=-1), 20, rtol=1e-9)
-        assert np.linalg.norm(smoother(times, direction, np.full((50, 1), 1e-2))(direction)[1], axis=-1).min() < 19
+        inner = slice(10, -10)
+        np.testing.assert_allclose(unit[inner], direction[inner], atol=1e-9)
+        np.testing.assert_allclose(np.linalg.norm(rate, axis=-1)[inner], 20, rtol=1e-9)
+        assert np.isnan(rate[0]).all()  # too few frames on one side for a velocity
+        in_space = smoother(times, direction, np.full((50, 1), 1e-2))(direction)[1]
+        assert np.linalg.norm(in_space, axis=-1)[inner].min() < 19.5
 
 
 class TestTracks:
