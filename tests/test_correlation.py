@@ -164,3 +164,10 @@ def test_repeated_residuals_are_judged_by_themselves():
     (curvature,) = torch.autograd.grad(slope.sum(), squared)
     torch.testing.assert_close(kernel.weight(squared), slope)
     torch.testing.assert_close(kernel.curvature(squared), curvature)
+
+
+def test_no_variance_is_negative_or_not_a_number_whatever_the_residuals_are():
+    spoiled = torch.tensor([[[1.0, 3.0], [3.0, 1.0]], [[torch.nan, 0.0], [0.0, 1.0]], [[2.0, 0.5], [0.5, 2.0]]])
+    found = correlated._not_below(spoiled, torch.tensor([0.5, 0.5, 0.5]))
+    torch.testing.assert_close(torch.linalg.eigvalsh(found), torch.tensor([[0.5, 4.0], [1.0, 1.0], [1.5, 2.5]]))
+    torch.testing.assert_close(found[2], spoiled[2])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import doctest
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
@@ -51,16 +52,44 @@ def test_spanning_tree_has_the_strongest_pairs_and_relates_only_the_necessary_on
     assert sorted(related) == [(0, 1), (0, 2), (1, 2), (2, 3)]
 
 
-def test_isolated_cameras_are_named_with_their_common_points():
-    observations, _ = golf_session(cameras=4, frames=20)
+def in_parts(*parts: str, frames: int = 30) -> Observations:
+    """A session whose cameras, one a letter, see the athlete in the frames of their part only."""
+    names = "".join(sorted("".join(parts)))
+    observations, _ = golf_session(cameras=len(names), frames=frames, noise=Noise(0.5))
     keypoints = observations.keypoints.clone()
-    keypoints[:2, 10:] = torch.nan
-    keypoints[2:, :10] = torch.nan
-    apart = Observations(keypoints, observations.intrinsics, observations.sticks, camera_names=["a", "b", "c", "d"])
+    for number, part in enumerate(parts):
+        for name in part:
+            seen = torch.zeros(frames, dtype=torch.bool)
+            seen[number * frames // len(parts) : (number + 1) * frames // len(parts)] = True
+            keypoints[names.index(name), ~seen] = torch.nan
+    return replace(observations, keypoints=keypoints, camera_names=list(names))
+
+
+def test_parts_of_a_rig_are_named_the_smallest_first_with_what_they_share():
     with pytest.raises(
-        RigError, match=r"c, d not connected .*; a and c have 0 common points, a and d .*at least 20 common points"
-    ):
-        calibrate(apart)
+        RigError, match=r"2 parts: c, d; a, b, e\. At best, a and c share 0 points; expected .*20 points"
+    ) as caught:
+        calibrate(in_parts("abe", "cd"))
+    assert caught.value.parts == (("c", "d"), ("a", "b", "e"))
+
+
+@pytest.mark.parametrize("parts", [("abd", "ce"), ("be", "acd"), ("bcd", "a")])
+def test_on_request_the_largest_part_is_calibrated_and_the_others_are_named(parts: tuple[str, ...]):
+    session = in_parts(*parts)
+    largest = max(parts, key=len)
+    others = {
+        "extends": "default",
+        "incomplete": "largest",
+        "refine": ["focal"],
+        "camera_groups": list(session.camera_names or ()),
+    }
+    found = calibrate(session, others)
+    alone = calibrate(session.of_cameras([session.camera_labels.index(name) for name in largest]), refine=["focal"])
+    assert found.camera_names == tuple(largest)
+    assert found.left_out == tuple(sorted(set("".join(parts)) - set(largest)))
+    assert any(sentence.endswith(f"{', '.join(found.left_out)}.") for sentence in found.warnings)
+    torch.testing.assert_close(found.rotations, alone.rotations, rtol=0, atol=0)
+    torch.testing.assert_close(found.translations, alone.translations, rtol=0, atol=0)
 
 
 def test_a_third_camera_resolves_a_twisted_pair():

@@ -70,6 +70,7 @@ def stick_seen_by_one() -> np.ndarray:
         ({"fps": "abc"}, r"frame rate.*'abc'"),
         ({"fps": 1e308}, "frame rate"),
         ({"readout_s": [0.01, 0.01, 0.02], "fps": 60, "image_size": (640, 480)}, "not a read-out time.*timestamps"),
+        ({"readout_s": 0.02, "fps": 60, "image_size": (640, 480)}, "read-out time longer than a frame.*at most 0.0166"),
         ({"point_names": 5}, "names do not fit"),
         ({"point_names": "abcd"}, "names do not fit"),
         ({"fisheye": [True, False, False]}, r"neither yes nor no \(fisheye\)"),

@@ -296,6 +296,7 @@ def test_presets_are_as_documented():
         "sports-stick-syn": 160,
         "sports-stick-syn-random": 160,
         "hard": 60,
+        "breakdown": 35,
         "regimes": 27,
     }
     every = [spec for name in PRESETS for spec in preset(name)]

@@ -40,6 +40,7 @@ FINGERPRINTS = {
     "sports-stick-syn": "7b79c826a27a5719",
     "sports-stick-syn-random": "05e8dc20b3e9daca",
     "hard": "8e5728b5eb2176c0",
+    "breakdown": "97a261ebe8305ad9",
     "regimes": "bc580f993765560b",
 }
 """Of the specifications of each preset."""

@@ -49,7 +49,7 @@ _HOMES = {
     "config_names": "config",
     "load_config": "config",
 }
-_SUBPACKAGES = {"analysis", "io", "losses", "metrics", "simulate", "video"}
+_SUBPACKAGES = {"analysis", "bridges", "io", "losses", "metrics", "simulate", "video"}
 
 __all__ = [
     "Calibration",

@@ -121,6 +121,8 @@ class Config:
             ``float32`` halves the memory and suits graphics cards that are slow in float64.
         initialise: the first estimate.
         relabel: whether label errors are undone: left and right of the body or the ends of a stick exchanged, another person.
+        incomplete: what to do with cameras that share too little to be one rig: ``refuse`` them, or calibrate the ``largest``
+            part of them alone and name the others.
         scale: a length between points that sets the scale instead of the sticks.
         refine: what else is estimated of the cameras, in every stage that estimates them; ``auto`` for what the keypoints
             contradict.
@@ -143,6 +145,7 @@ class Config:
     precision: Literal["float64", "float32"] = "float64"
     initialise: InitialiseSettings = field(default_factory=InitialiseSettings)
     relabel: bool = False
+    incomplete: Literal["refuse", "largest"] = "refuse"
     scale: ScaleSettings | None = None
     refine: list[Refine] | Literal["auto"] = field(default_factory=list)
     camera_groups: list[str] = field(default_factory=list)

@@ -54,7 +54,16 @@ class ObservationError(CalibrationError):
 
 
 class RigError(CalibrationError):
-    """Cameras that have too few common points to be placed in one rig."""
+    """Cameras that have too few common points to be placed in one rig.
+
+    Args:
+        parts: names of the cameras of each part into which the rig falls, the smallest part first; empty where that is not the
+            reason.
+    """
+
+    def __init__(self, *arguments: Any, parts: tuple[tuple[str, ...], ...] = (), **named: Any) -> None:
+        super().__init__(*arguments, **named)
+        self.parts = parts
 
 
 class ConfigError(CalibrationError):

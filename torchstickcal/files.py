@@ -110,6 +110,20 @@ def check_text(text: str, where: str) -> None:
         raise CalibrationError("a text that cannot be written", where=where, got=ascii(text), expected=expected) from error
 
 
+def without_nan(content: Any) -> Any:
+    """Lists and dictionaries as JSON can hold them: None in the place of NaN and infinities.
+
+    Example:
+        >>> without_nan({"lengths_m": [1.0, float("nan")]})
+        {'lengths_m': [1.0, None]}
+    """
+    if isinstance(content, dict):
+        return {key: without_nan(value) for key, value in content.items()}
+    if isinstance(content, list | tuple):
+        return [without_nan(value) for value in content]
+    return None if isinstance(content, float) and not math.isfinite(content) else content
+
+
 def json_text(content: Any, indent: int | None = 2) -> str:
     """JSON that every reader accepts: null in the place of NaN and infinities. On one line without an ``indent``.
 
@@ -119,7 +133,7 @@ def json_text(content: Any, indent: int | None = 2) -> str:
           "mean_m": null
         }
     """
-    return json.dumps(_with_null(content), indent=indent, allow_nan=False)
+    return json.dumps(without_nan(content), indent=indent, allow_nan=False)
 
 
 def parse_toml(content: bytes) -> dict[str, Any]:
@@ -138,14 +152,6 @@ def parse_toml(content: bytes) -> dict[str, Any]:
         raise ValueError(f"a byte at position {error.start} that is not UTF-8; save the file as UTF-8") from error
     except RecursionError as error:
         raise ValueError("brackets within brackets, too many to be read") from error
-
-
-def _with_null(content: Any) -> Any:
-    if isinstance(content, dict):
-        return {key: _with_null(value) for key, value in content.items()}
-    if isinstance(content, list | tuple):
-        return [_with_null(value) for value in content]
-    return None if isinstance(content, float) and not math.isfinite(content) else content
 
 
 @contextmanager

@@ -193,6 +193,31 @@ class Observations:
         """The same observations on another device."""
         return replace(self, keypoints=self.keypoints.to(device))
 
+    def of_cameras(self, cameras: Sequence[int]) -> Observations:
+        """The same observations of some of the cameras, by their indices.
+
+        Raises:
+            ObservationError: if an index is no camera's.
+        """
+        if wrong := [camera for camera in cameras if camera not in range(self.num_cameras)]:
+            expected = f"indices from 0 to {self.num_cameras - 1}"
+            raise ObservationError("no such camera", where="cameras", got=wrong[0], expected=expected)
+        own = list(cameras)
+
+        def chosen(given: Tensor | None, of_one: int) -> Tensor | None:
+            return given if given is None or given.ndim == of_one else given[own]
+
+        return replace(
+            self,
+            keypoints=self.keypoints[own],
+            intrinsics=chosen(self.intrinsics, 2),
+            distortion=chosen(self.distortion, 1),
+            confidence=chosen(self.confidence, 2),
+            image_size=chosen(self.image_size, 1),
+            timestamps=chosen(self.timestamps, 1),
+            camera_names=[self.camera_label(camera) for camera in own],
+        )
+
     def with_stick_length(self, length_m: float) -> Observations:
         """The same observations with another length for their only stick.
 
@@ -321,6 +346,14 @@ class Observations:
                 where="readout_s",
                 got=f"image_size {self.image_size}, fps {self.fps}",
                 expected="image_size, and fps or timestamps",
+            )
+        if self.readout_s is not None and self.fps is not None and self.readout_s * self.fps > 1:
+            raise ObservationError(
+                "a read-out time longer than a frame",
+                where="readout_s",
+                got=f"{self.readout_s:g} s",
+                expected=f"at most {1 / self.fps:g} s at {self.fps:g} frames per second",
+                remedy="Give it in seconds; most cameras need 0.005 to 0.03 s.",
             )
 
     def _check_sticks(self) -> None:

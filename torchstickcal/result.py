@@ -24,7 +24,7 @@ from torchstickcal.solvers.uncertainty import centre_covariances, point_covarian
 from torchstickcal.stick import Stick
 from torchstickcal.untrusted import open_arrays, reading
 
-_FORMAT = "torchstickcal calibration 6"
+_FORMAT = "torchstickcal calibration 7"
 _TENSORS = {
     "rotations": "C 3 3",
     "translations": "C 3",
@@ -153,6 +153,9 @@ class Calibration:
     """time of the initialisation, of the search for label errors, of each stage and in total"""
     warnings: tuple[str, ...]
     """what a careful user should know"""
+    left_out: tuple[str, ...] = ()
+    """names of the cameras that share too little with the others, where only the largest part was to be calibrated. They are in
+    no other part of the result."""
 
     @property
     def converged(self) -> bool:
@@ -287,9 +290,10 @@ class Calibration:
             "fps": self.fps,
             "point_names": self.point_names,
             "camera_names": self.camera_names,
-            "stages": [dataclasses.asdict(stage) | {"stop": stage.stop.name} for stage in self.stages],
+            "stages": [_stage_as_plain(stage) for stage in self.stages],
             "seconds": self.seconds,
             "warnings": self.warnings,
+            "left_out": self.left_out,
         }
         with atomic_path(path) as temporary, temporary.open("wb") as file:
             np.savez_compressed(file, meta=np.array(json.dumps(meta)), **arrays)
@@ -323,6 +327,7 @@ class Calibration:
                 stages=tuple(_stage_record(stage) for stage in _checked(meta["stages"], list)),
                 seconds=_numbers(meta["seconds"]),
                 warnings=_texts(meta["warnings"]),
+                left_out=_texts(meta["left_out"]),
             )
             counts = {"C": calibration.camera_names, "P": calibration.point_names, "S": calibration.sticks}
             if any(given is not None and len(given) != sizes[axis] for axis, given in counts.items()):
@@ -355,6 +360,13 @@ def _parameter(arrays: Mapping[str, Any], name: str, about: dict[str, Any], came
         _checked(about["refined"], bool),
         **tensors,
     )
+
+
+def _stage_as_plain(stage: StageRecord) -> dict[str, Any]:
+    """What is saved of a stage: all but the poses at each iteration."""
+    poses = {"rotations", "translations"}
+    iterations = [{name: value for name, value in vars(record).items() if name not in poses} for record in stage.iterations]
+    return {**vars(stage), "stop": stage.stop.name, "iterations": iterations}
 
 
 def _stage_record(stage: dict[str, Any]) -> StageRecord:

@@ -29,9 +29,12 @@ The norm is 1 if all frames of the window are known and equally certain."""
 _UNSHRUNK_DEGREES, _HIGH_DEGREES = 2, 3
 """Number of lowest degrees that are never shrunk, and of highest degrees that indicate motion between the frames."""
 _NEIGHBOURS = (-3, -2, -1, 1, 2, 3)
-_MAX_DEVIATION, _MAX_DEVIATION_CONFIRMED = 4.0, 8.0
-"""Distance of a point from the prediction by its neighbours in time, over the usual distance, beyond which it is ignored: for a
-point seen by two cameras, and for a point that a third camera confirms."""
+_USUAL_NOISE, _MAX_NOISE = 1.25, 5.5
+"""Distance of a point from the prediction by its neighbours in time, over the standard deviation of its position: the usual one
+where there is noise alone, and one beyond which the point is ignored."""
+_MAX_MOTION, _MAX_MOTION_CONFIRMED = 4.0, 8.0
+"""How much of the usual distance beyond noise, which is due to the motion, is allowed too: for a point seen by two cameras, and
+for a point that a third camera confirms."""
 _MAX_FIT_SIGMAS = 2.0
 """Standard deviations of the chi-square residual above its mean up to which a polynomial follows the motion."""
 _INTERPOLATION_ERROR = 0.15
@@ -133,7 +136,8 @@ def _is_consistent(points: Tensor, variance: Tensor, views: Tensor) -> Tensor:
     """Whether points are near the prediction by their neighbours in time, relative to their usual distance from it, (F, P).
 
     The prediction is the median of midpoints and linear extrapolations. This test detects wrong keypoints of points that only
-    two cameras see: no third camera can contradict these.
+    two cameras see, which no third camera can contradict, and moderately wrong ones that were not rejected: they would make
+    velocities that are not there, and so wrong time offsets.
     """
     known = points.where(variance.isfinite(), torch.nan)
     neighbours = dict(zip(_NEIGHBOURS, shifted_in_time(known, _NEIGHBOURS), strict=True))
@@ -142,8 +146,9 @@ def _is_consistent(points: Tensor, variance: Tensor, views: Tensor) -> Tensor:
     prediction = torch.stack([*midpoints, *extrapolations]).nanmedian(0).values
     distance = (known - prediction).square().sum(0).sqrt()
     usual = shifted_in_time(distance, range(-_HALF_WIDTHS[1], _HALF_WIDTHS[1] + 1)).nanmedian(0).values
-    limit = torch.where(views > 2, _MAX_DEVIATION_CONFIRMED, _MAX_DEVIATION)
-    return ~(distance > limit * (usual + (3 * variance).sqrt()))
+    noise = (3 * variance).sqrt()
+    motion = (usual - _USUAL_NOISE * noise).clamp_min(0.0)
+    return ~(distance > _MAX_NOISE * noise + torch.where(views > 2, _MAX_MOTION_CONFIRMED, _MAX_MOTION) * motion)
 
 
 def shifted_in_time(values: Tensor, steps: Sequence[int]) -> Tensor:

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import time
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal, Protocol
 
 from torchstickcal.config import Config, Refine, load_config, with_refine
+from torchstickcal.errors import RigError
 from torchstickcal.losses import LOSSES
 from torchstickcal.model.unknowns import REFINEMENTS
 from torchstickcal.observations import Observations
@@ -24,7 +26,10 @@ _ = len(LOSSES), len(REFINEMENTS)  # imported now: a process that is forked whil
 
 
 class Callback(Protocol):
-    """What may listen to a calibration: a progress bar, TensorBoard, a test."""
+    """What may listen to a calibration: a progress bar, TensorBoard, a test.
+
+    A callback may also have a method ``on_start(observations)``, which is called before the first step.
+    """
 
     def on_iteration(self, record: IterationRecord) -> None:
         """After each iteration."""
@@ -71,11 +76,29 @@ def calibrate(
     settings = load_config(config)
     if refine is not None:
         settings = with_refine(settings, refine)
-    return on_worker(observations.keypoints.device, _calibrated, observations, settings, callback)
+    calibrated = _calibrated if settings.incomplete == "refuse" else _largest_part
+    return on_worker(observations.keypoints.device, calibrated, observations, settings, callback)
 
 
-def _calibrated(observations: Observations, config: Config, callback: Callback | None) -> Calibration:
+def _largest_part(observations: Observations, config: Config, callback: Callback | None) -> Calibration:
+    """All cameras, or where they are no one rig, those of its largest part."""
+    try:
+        return _calibrated(observations, config, callback)
+    except RigError as error:
+        if not error.parts or len(error.parts[-1]) < 2:
+            raise
+        left_out = tuple(name for part in error.parts[:-1] for name in part)
+    cameras = [camera for camera, name in enumerate(observations.camera_labels) if name not in left_out]
+    groups = [config.camera_groups[camera] for camera in cameras] if config.camera_groups else []
+    return _calibrated(observations.of_cameras(cameras), replace(config, camera_groups=groups), callback, left_out)
+
+
+def _calibrated(
+    observations: Observations, config: Config, callback: Callback | None, left_out: tuple[str, ...] = ()
+) -> Calibration:
     began = time.perf_counter()
+    if (on_start := getattr(callback, "on_start", None)) is not None:
+        on_start(observations)
     run = Run(config, callback.on_iteration if callback else ignore_record)
     models = ModelSelection(observations, run)
 
@@ -96,7 +119,7 @@ def _calibrated(observations: Observations, config: Config, callback: Callback |
     # 6. Conclude: covariance, warnings, and the result in the caller's dtype.
     unsynchronised = config.synchronise and "time_offset" not in ended.refined and models.unsynchronised
     run.took("total", time.perf_counter() - began)
-    calibration = conclude(ended, check, clocks, unsynchronised, run.seconds)
+    calibration = conclude(ended, check, clocks, unsynchronised, left_out, run.seconds)
     if callback:
         callback.on_end(calibration)
     return calibration

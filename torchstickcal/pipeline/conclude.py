@@ -18,7 +18,12 @@ from torchstickcal.solvers.uncertainty import camera_covariance, likelihood, rul
 
 
 def conclude(
-    ended: Adjustment, check: CameraCheck, clocks: ClockEstimate | None, unsynchronised: bool, seconds: Mapping[str, float]
+    ended: Adjustment,
+    check: CameraCheck,
+    clocks: ClockEstimate | None,
+    unsynchronised: bool,
+    left_out: tuple[str, ...],
+    seconds: Mapping[str, float],
 ) -> Calibration:
     """The calibration of one session.
 
@@ -27,6 +32,7 @@ def conclude(
         check: what the keypoints say of lenses and clocks.
         clocks: what a search for time offsets has found; None without one.
         unsynchronised: whether the motion contradicts the clocks, which were not estimated.
+        left_out: names of the cameras that are no part of the rig.
         seconds: time by step.
     """
     observations, frames, measurements = ended.observations[0], ended.frames[0], ended.measurements
@@ -68,7 +74,8 @@ def conclude(
         camera_names=observations.camera_labels,
         stages=ended.records[0],
         seconds=dict(seconds),
-        warnings=warnings_of(ended, unknowns, clocks, unsynchronised),
+        warnings=warnings_of(ended, unknowns, clocks, unsynchronised, left_out),
+        left_out=left_out,
     )
 
 

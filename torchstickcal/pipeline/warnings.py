@@ -28,7 +28,11 @@ _WRONG_LENGTH_SHARE, _WRONG_LENGTH_SIGMAS = 0.02, 4.0
 
 
 def warnings_of(
-    ended: Adjustment, unknowns: Mapping[str, CameraParameter], clocks: ClockEstimate | None, unsynchronised: bool
+    ended: Adjustment,
+    unknowns: Mapping[str, CameraParameter],
+    clocks: ClockEstimate | None,
+    unsynchronised: bool,
+    left_out: tuple[str, ...] = (),
 ) -> tuple[str, ...]:
     """All warnings about a session where its last stage ended.
 
@@ -37,8 +41,9 @@ def warnings_of(
         unknowns: what may be unknown of the cameras, as found and as the keypoints suggest.
         clocks: what a search for time offsets has found; None without one.
         unsynchronised: whether the motion contradicts the clocks, which were not estimated.
+        left_out: names of the cameras that are no part of the rig.
     """
-    found = [*ended.observations[0].warnings, *_labels(ended), *_keypoints(ended), *_same_views(ended)]
+    found = [*ended.observations[0].warnings, *_left_out(left_out), *_labels(ended), *_keypoints(ended), *_same_views(ended)]
     if len(ended.measurements.sticks) > 1:
         found += _contradicted_lengths(ended)
     for name, unknown in all_unknowns().items():
@@ -53,6 +58,13 @@ def warnings_of(
         if reason:
             found.append(f"{ended.observations[0].camera_label(camera)}: its time offset is uncertain, {reason}.")
     return tuple(found)
+
+
+def _left_out(cameras: tuple[str, ...]) -> list[str]:
+    """Cameras that are no part of the rig."""
+    if not cameras:
+        return []
+    return [f"Not calibrated, because they share too few points with the other cameras: {', '.join(cameras)}."]
 
 
 def _labels(ended: Adjustment) -> list[str]:

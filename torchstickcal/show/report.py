@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import math
 from typing import Any
 
 from torch import Tensor
 
+from torchstickcal.files import without_nan
 from torchstickcal.model.unknowns import all_unknowns
 from torchstickcal.result import Calibration, CameraParameter
 
@@ -60,69 +60,71 @@ def table(calibration: Calibration) -> str:
 
 
 def summary(calibration: Calibration) -> dict[str, Any]:
-    """The calibration without its arrays, as JSON can hold it."""
-    return {
-        "status": calibration.status,
-        "converged": calibration.converged,
-        "cameras": [
-            {
-                "name": name,
-                "centre_m": centre,
-                "rotation": rotation,
-                "translation_m": translation,
-                "centre_std_m": std_m,
-                "rotation_std_deg": std_deg,
-                "reprojection_median_px": median_px if math.isfinite(median_px) else None,
-                "keypoints": keypoints,
-                "frames_relabelled": relabelled,
-                "frames_of_another_person": other,
-            }
-            for name, centre, rotation, translation, std_m, std_deg, median_px, keypoints, relabelled, other in zip(
-                calibration.camera_names,
-                calibration.camera_centres.tolist(),
-                calibration.rotations.tolist(),
-                calibration.translations.tolist(),
-                calibration.camera_std_m.tolist(),
-                calibration.camera_std_deg.tolist(),
-                calibration.reprojection_median_px.tolist(),
-                _keypoints_used(calibration),
-                calibration.relabelled.any(-1).sum(-1).tolist(),
-                calibration.other_person.sum(-1).tolist(),
-                strict=True,
-            )
-        ],
-        "refined": list(calibration.refined),
-        "unknowns": {name: _parameter_summary(calibration, parameter) for name, parameter in calibration.unknowns.items()},
-        "points": [
-            {"name": _point_name(calibration, index), "sigma_px": sigma}
-            for index, sigma in enumerate(calibration.sigma_px.tolist())
-        ],
-        "scale_std": _finite(calibration.scale_std),
-        "sticks": [
-            {
-                "start": stick.ends[0],
-                "end": stick.ends[1],
-                "length_m": stick.length_m,
-                "mean_m": _finite(lengths.nanmean()),
-                "spread_m": _finite(lengths[lengths.isfinite()].std(correction=0)),
-                "frames": int(lengths.isfinite().sum()),
-            }
-            for stick, lengths in zip(calibration.sticks, calibration.stick_lengths_m.mT, strict=True)
-        ],
-        "stages": [
-            {
-                "name": stage.name,
-                "stop": stage.stop.value,
-                "converged": stage.stop.converged,
-                "iterations": stage.iterations[-1].iteration,
-                "cost": stage.iterations[-1].cost,
-                "seconds": stage.seconds,
-            }
-            for stage in calibration.stages
-        ],
-        "seconds": calibration.seconds,
-        "warnings": list(calibration.warnings),
-    }
+    """The calibration without its arrays, as JSON can hold it: None where a number is not known."""
+    return without_nan(
+        {
+            "status": calibration.status,
+            "converged": calibration.converged,
+            "cameras": [
+                {
+                    "name": name,
+                    "centre_m": centre,
+                    "rotation": rotation,
+                    "translation_m": translation,
+                    "centre_std_m": std_m,
+                    "rotation_std_deg": std_deg,
+                    "reprojection_median_px": median_px,
+                    "keypoints": keypoints,
+                    "frames_relabelled": relabelled,
+                    "frames_of_another_person": other,
+                }
+                for name, centre, rotation, translation, std_m, std_deg, median_px, keypoints, relabelled, other in zip(
+                    calibration.camera_names,
+                    calibration.camera_centres.tolist(),
+                    calibration.rotations.tolist(),
+                    calibration.translations.tolist(),
+                    calibration.camera_std_m.tolist(),
+                    calibration.camera_std_deg.tolist(),
+                    calibration.reprojection_median_px.tolist(),
+                    _keypoints_used(calibration),
+                    calibration.relabelled.any(-1).sum(-1).tolist(),
+                    calibration.other_person.sum(-1).tolist(),
+                    strict=True,
+                )
+            ],
+            "refined": list(calibration.refined),
+            "unknowns": {name: _parameter_summary(calibration, parameter) for name, parameter in calibration.unknowns.items()},
+            "points": [
+                {"name": _point_name(calibration, index), "sigma_px": sigma}
+                for index, sigma in enumerate(calibration.sigma_px.tolist())
+            ],
+            "scale_std": float(calibration.scale_std),
+            "sticks": [
+                {
+                    "start": stick.ends[0],
+                    "end": stick.ends[1],
+                    "length_m": stick.length_m,
+                    "mean_m": float(lengths.nanmean()),
+                    "spread_m": float(lengths[lengths.isfinite()].std(correction=0)),
+                    "frames": int(lengths.isfinite().sum()),
+                }
+                for stick, lengths in zip(calibration.sticks, calibration.stick_lengths_m.mT, strict=True)
+            ],
+            "stages": [
+                {
+                    "name": stage.name,
+                    "stop": stage.stop.value,
+                    "converged": stage.stop.converged,
+                    "iterations": stage.iterations[-1].iteration,
+                    "cost": stage.iterations[-1].cost,
+                    "seconds": stage.seconds,
+                }
+                for stage in calibration.stages
+            ],
+            "seconds": calibration.seconds,
+            "warnings": list(calibration.warnings),
+        }
+    )
 
 
 def printable(text: str) -> str:
@@ -167,7 +169,7 @@ def _parameter_summary(calibration: Calibration, parameter: CameraParameter) -> 
         "cameras": [
             {"name": name}
             | {
-                tensor: dict(zip(parameter.components, map(_finite, parameter.by_component(tensor)[camera]), strict=True))
+                tensor: dict(zip(parameter.components, parameter.by_component(tensor)[camera].tolist(), strict=True))
                 for tensor in tensors
             }
             for camera, name in enumerate(calibration.camera_names)
@@ -181,11 +183,6 @@ def _keypoints_used(calibration: Calibration) -> list[int]:
 
 def _point_name(calibration: Calibration, index: int) -> str:
     return calibration.point_names[index] if calibration.point_names else f"point {index}"
-
-
-def _finite(value: Tensor) -> float | None:
-    """JSON has no NaN."""
-    return float(value) if bool(value.isfinite()) else None
 
 
 def _aligned(rows: list[list[str]]) -> str:

@@ -162,6 +162,27 @@ def hard() -> tuple[SessionSpec, ...]:
     return tuple(specs)
 
 
+def breakdown() -> tuple[SessionSpec, ...]:
+    """35 sessions of 4 cameras and 60 frames, in which 0 to 60 % of the keypoints are outliers: where does a method fail?"""
+    return tuple(
+        SessionSpec(
+            name=f"outliers{round(100 * share):02d}_{sport}_{number}",
+            sport=sport,
+            seed=90_000 + number,
+            cameras=4,
+            frames=60,
+            fps=30.0,
+            layout="ring",
+            lens=_VIDEO,
+            radius_m=4.5,
+            path="circle",
+            regimes=(DetectorNoise(2.5, 1.5), SelfOcclusion(), Outliers(share)),
+        )
+        for share in (0.0, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6)
+        for number, sport in enumerate(_HARD_SPORTS)
+    )
+
+
 def regimes() -> tuple[SessionSpec, ...]:
     """27 sessions with errors of clocks, intrinsics or stick length, one at a time and together; 6 cameras, 300 frames."""
     errors: dict[str, tuple[Clocks, Assumptions]] = {
@@ -199,6 +220,7 @@ PRESETS = {
     "sports-stick-syn": sports_stick_syn,
     "sports-stick-syn-random": lambda: sports_stick_syn("random"),
     "hard": hard,
+    "breakdown": breakdown,
     "regimes": regimes,
 }
 """The functions that make the specifications of each preset, by name."""

@@ -38,6 +38,9 @@ _SPECTRUM_VALUES = 2**23
 _MOST_TAKEN_UP = 0.8
 """Share of a point's lasting errors that the cameras can have taken up at most, in the correction for it."""
 
+_LEAST_OF_WHITE = 0.1
+"""Least variance of an estimate, as a part of that by independent errors of the same keypoints, each with its weight."""
+
 
 def inflation(objective: Objective, state: State, root: Tensor, correlation: ErrorCorrelation, times: Tensor) -> Tensor:
     """The matrix E of the module's text, (B, D, D), D = 6 (C - 1) + K.
@@ -64,7 +67,18 @@ def inflation(objective: Objective, state: State, root: Tensor, correlation: Err
             lasting = lasting + product + product.mT
     worth, hidden, noise = 1 / times, *_hidden(lasting, m, correlation, 1 / times)
     by_point = (worth - 1)[..., None, None] * white + (worth * hidden)[..., None, None] * lasting
-    return noise[:, None, None] * (torch.eye(root.shape[-1]).to(root) + by_point.sum(1))
+    found = noise[:, None, None] * (torch.eye(root.shape[-1]).to(root) + by_point.sum(1))
+    return _not_below(found, _LEAST_OF_WHITE * worth.amin(1))
+
+
+def _not_below(symmetric: Tensor, least: Tensor) -> Tensor:
+    """Symmetric matrices (B, D, D) with eigenvalues of at least ``least`` (B,); the identity where one is not finite.
+
+    Rounding leaves negative ones where the residuals fit no model of errors, as in a session that did not converge.
+    """
+    finite = symmetric.isfinite().flatten(1).all(1)[:, None, None]
+    values, vectors = torch.linalg.eigh(symmetric.where(finite, torch.eye(symmetric.shape[-1]).to(symmetric)))
+    return (vectors * values.maximum(least[:, None])[:, None]) @ vectors.mT
 
 
 def _hidden(lasting: Tensor, m: Measurements, correlation: ErrorCorrelation, worth: Tensor) -> tuple[Tensor, Tensor]:

@@ -21,7 +21,7 @@ from torchstickcal.solvers.base import IterationRecord, Listener, Outcome, Stop,
 from torchstickcal.solvers.elimination.normal_equations import NormalEquations
 from torchstickcal.solvers.elimination.points import PointElimination
 
-_ITERATIONS_PER_ROUND = 100
+_ITERATIONS_PER_ROUND, _MAX_ROUNDS = 100, 20
 _DAMPING = 1e-6
 
 
@@ -73,7 +73,8 @@ def lbfgs(
     """Minimise an objective over the points and, with ``cameras_free``, over all cameras but the first.
 
     The sessions are solved one after another, in rounds. Each round renews the preconditioner and starts LBFGS with an empty
-    history. There is one record per round, and ``max_iterations`` counts rounds.
+    history. There is one record per round, and ``max_iterations`` counts rounds, of which there are at most 20: a session that
+    needs more does not converge.
     """
     states: list[State] = []
     stops: list[Stop] = []
@@ -98,7 +99,8 @@ def _solve_session(
 ) -> tuple[State, Stop, tuple[IterationRecord, ...]]:
     stop, step_m = Stop.ITERATIONS, 0.0
     records: list[IterationRecord] = []
-    for iteration in range(termination.max_iterations + 1):
+    last = min(termination.max_iterations, _MAX_ROUNDS)
+    for iteration in range(last + 1):
         system = NormalEquations(objective, state, cameras_free, _DAMPING)
         (record,) = system.records(stage, [iteration], [0.0], [step_m])
         records.append(replace(record, session=session))
@@ -106,7 +108,7 @@ def _solve_session(
         if iteration and records[-2].cost - records[-1].cost <= termination.cost_tolerance * records[-1].cost:
             stop = Stop.COST
             break
-        if iteration == termination.max_iterations:
+        if iteration == last:
             break
         factor, failed = torch.linalg.cholesky_ex(system.reduced[0])
         moved = None if int(failed) else _run_round(objective, _PreconditionedState(system, factor.mT, state))

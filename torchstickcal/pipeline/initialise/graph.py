@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from typing import NamedTuple
 
 import cv2
@@ -52,15 +52,36 @@ def spanning_tree(
         min_common: smallest number of inliers of an edge.
 
     Raises:
-        RigError: if a camera cannot be connected. The message names it and the pairs with too few points.
+        RigError: if the cameras fall into several parts. The message names them, the smallest first, and what they share.
     """
-    pairs = list(itertools.combinations(range(len(labels)), 2))
-    placed, edges, related = set[int](), list[Edge](), dict[tuple[int, int], Pair]()
-    while len(placed) < len(labels):
-        crossing = [(i, j) for i, j in pairs if not placed or (i in placed) != (j in placed)]
+    related, waiting = dict[tuple[int, int], Pair](), set(range(len(labels)))
+    trees = list[list[Edge]]()
+    parts = list[set[int]]()
+    while waiting:
+        edges = _grown(waiting, common, relate, related, min_common)
+        trees.append(edges)
+        parts.append({camera for edge in edges for camera in (edge.parent, edge.child)} or {min(waiting)})
+        waiting -= parts[-1]
+    if len(parts) > 1:
+        counts = {pair: related[pair].inliers if pair in related else int(common[pair]) for pair in _pairs(range(len(labels)))}
+        raise _disconnected(sorted(map(sorted, parts), key=len), counts, labels, min_common)
+    return trees[0]
+
+
+def _grown(
+    cameras: set[int],
+    common: NDArray[np.int_],
+    relate: Callable[[int, int], Pair],
+    related: dict[tuple[int, int], Pair],
+    min_common: int,
+) -> list[Edge]:
+    """The edges of the tree that grows from the strongest pair of some cameras; ``related`` takes up what it estimates."""
+    placed, edges = set[int](), list[Edge]()
+    while True:
+        crossing = [(i, j) for i, j in _pairs(cameras) if not placed or (i in placed) != (j in placed)]
         usable = [pair for pair in crossing if (related[pair].inliers if pair in related else common[pair]) >= min_common]
         if not usable:
-            raise _disconnected({pair: int(common[pair]) for pair in crossing}, placed or {0}, labels, min_common)
+            return edges
         bounds = {pair: related[pair].strength if pair in related else float(common[pair]) for pair in usable}
         best = max(usable, key=lambda pair: bounds[pair])
         if best not in related:
@@ -73,7 +94,10 @@ def spanning_tree(
         else:
             edges.append(Edge(best[1], best[0], tuple(pose.inverse() for pose in poses)))
         placed |= set(best)
-    return edges
+
+
+def _pairs(cameras: Iterable[int]) -> list[tuple[int, int]]:
+    return list(itertools.combinations(sorted(cameras), 2))
 
 
 def propagate(edges: Sequence[Edge], views: Views, scale: float) -> tuple[Array, Array]:
@@ -230,13 +254,28 @@ def _place_camera(
     return float(weights.sum()), rotation, translation
 
 
-def _disconnected(common: dict[tuple[int, int], int], placed: set[int], labels: Sequence[str], min_common: int) -> RigError:
-    isolated = [label for index, label in enumerate(labels) if index not in placed]
-    counts = ", ".join(f"{labels[i]} and {labels[j]} have {count} common points" for (i, j), count in common.items())
+def _disconnected(
+    parts: list[list[int]], shared: dict[tuple[int, int], int], labels: Sequence[str], min_common: int
+) -> RigError:
+    """The error that names the parts, the smallest first, and what they share.
+
+    Args:
+        parts: cameras of each part.
+        shared: for each pair of cameras, the number of points that fit one relative pose, or an upper bound of it.
+        labels: names of the cameras.
+        min_common: number of such points from which a pair connects two parts.
+    """
+    named = [", ".join(labels[camera] for camera in part) for part in parts]
+    links: list[str] = []
+    for first, second in itertools.combinations(parts, 2):
+        i, j = max((sorted((a, b)) for a in first for b in second), key=lambda pair: shared[pair[0], pair[1]])
+        links.append(f"{labels[i]} and {labels[j]} share {shared[i, j]} points")
     return RigError(
-        "cameras see too little in common to be placed in one rig",
+        "the cameras fall into parts that see too little in common to be one rig",
         where="keypoints",
-        got=f"{', '.join(isolated)} not connected to the other cameras; {counts}",
-        expected=f"at least {min_common} common points that fit one relative pose, in one of these pairs",
-        remedy="Record a longer session in which these cameras and others see the athlete in the same frames, or remove them.",
+        got=f"{len(parts)} parts: {'; '.join(named)}. At best, {', '.join(links)}",
+        expected=f"pairs of cameras between the parts that share at least {min_common} points that fit one relative pose",
+        remedy="Record a longer session in which cameras of different parts see the athlete together, remove cameras, or "
+        'calibrate the largest part alone (incomplete = "largest").',
+        parts=tuple(tuple(labels[camera] for camera in part) for part in parts),
     )
