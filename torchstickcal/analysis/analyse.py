@@ -124,7 +124,7 @@ def analyse(
         >>> {event: round(figure.value, 1) for event, figure in swing.events.items()}
         {'takeaway': 0.3, 'top': 1.2, 'impact': 1.4, 'finish': 2.0}
         >>> swing.figures["peak_tip_speed"].unit, sorted(analysis.curves)[:2]
-        ('m/s', ['left_elbow_flexion', 'left_knee_flexion'])
+        ('m/s', ['left_elbow_flexion', 'left_shoulder_elevation'])
     """
     rules = sport_named(sport)
     tracks = tracks_of(calibration, fps, up)

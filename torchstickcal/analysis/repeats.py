@@ -27,7 +27,7 @@ def multiple_correlation(curves: Array) -> float:
     Example:
         >>> curve = np.sin(np.linspace(0, 6, 101))
         >>> round(multiple_correlation(np.stack([curve, curve + 0.1, curve - 0.1])), 3)
-        0.993
+        0.99
         >>> multiple_correlation(np.stack([curve, curve]))
         1.0
     """

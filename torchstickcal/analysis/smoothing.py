@@ -17,7 +17,7 @@ Array = NDArray[np.float64]
 Neighbours = Callable[[Array, int], Array]
 """Values (..., T, S, D), and an offset in frames, to the values of those frames as they are averaged, (..., T, S, D)"""
 
-HALF_WIDTHS = (3, 4, 5, 6, 8, 10, 13, 16, 20, 25, 32, 40)
+HALF_WIDTHS = (2, 3, 4, 5, 6, 8, 10, 13, 16, 20, 25, 32, 40)
 """Frames before and after."""
 _ORDER = 3
 _AGREEMENT = 1.4
@@ -30,8 +30,9 @@ _STEADY_FRAMES = 2
 """The window of a frame is the median over so many frames before and after it."""
 _FARTHEST_TURN_RAD = 1.75
 _LEAST_CONDITION = 1e-7
-_LARGEST_SLOPE_GAIN = 1.5 * 1588 / 6048
-"""1.5 times the variance, per frame squared, of the slope of a cubic polynomial through seven frames with errors of 1."""
+_LARGEST_SLOPE_GAINS = {2: 1.5 * 130 / 144, 3: 1.5 * 1588 / 6048}
+"""1.5 times the variance, per frame squared, of the slope in the middle of a cubic polynomial through five or seven frames with
+errors of 1. Longer windows have the second one."""
 
 
 def shifted(values: Array, offset: int) -> Array:
@@ -102,7 +103,7 @@ def smoother(times: Array, values: Array, variances: Array, neighbours: Neighbou
         >>> track = np.sin(2 * np.pi * times)[:, None, None] + 0.01 * rng.standard_normal((200, 1, 1))
         >>> smooth = smoother(times, track, np.full((200, 1), 1e-4))
         >>> value, slope = smooth(track)
-        >>> bool(np.abs(value[:, 0, 0] - np.sin(2 * np.pi * times)).max() < 0.02)
+        >>> bool(np.abs(value[:, 0, 0] - np.sin(2 * np.pi * times))[5:-5].max() < 0.02)
         True
         >>> bool(smooth.gains[100, 0, 0] < 0.5)
         True
@@ -134,7 +135,7 @@ def smoother(times: Array, values: Array, variances: Array, neighbours: Neighbou
                 moments += weighted[..., :, None] * powers[number][..., None, :]
                 sums += weighted[..., :, None] * np.nan_to_num(near[number])[..., None, :]
         before = width
-        covariance = _sure(_inverse(moments), typical)
+        covariance = _sure(_inverse(moments), typical * _LARGEST_SLOPE_GAINS[min(width, max(_LARGEST_SLOPE_GAINS))])
         estimate = covariance[..., :2, :] @ sums
         tried.append((covariance[..., :2, :], estimate, np.diagonal(covariance, axis1=-2, axis2=-1)[..., :2]))
     determined = np.stack([np.isfinite(variance).all(-1) for _, _, variance in tried])
@@ -165,16 +166,16 @@ def _inverse(moments: Array) -> Array:
     return np.where(determined[..., None, None], inverse, np.nan)
 
 
-def _sure(covariance: Array, typical: Array) -> Array:
-    """Covariances (T, S, n, n), NaN where velocities are less sure than in the middle of the shortest window.
+def _sure(covariance: Array, largest: Array) -> Array:
+    """Covariances (T, S, n, n), NaN where velocities are less sure than in the middle of a short window.
 
     At the ends of a recording and beside gaps, a polynomial through few frames on one side would say nothing of the velocity.
 
     Args:
         covariance: of the polynomials.
-        typical: (1, S), variances of single frames.
+        largest: (1, S), variances that velocities may have.
     """
-    sure = covariance[..., 1, 1] <= _LARGEST_SLOPE_GAIN * typical
+    sure = covariance[..., 1, 1] <= largest
     return np.where(sure[..., None, None], covariance, np.nan)
 
 
