@@ -30,6 +30,8 @@ _STEADY_FRAMES = 2
 """The window of a frame is the median over so many frames before and after it."""
 _FARTHEST_TURN_RAD = 1.75
 _LEAST_CONDITION = 1e-7
+_CLEAR = 2.2
+"""The same for the shortest window, which is noisy and is used only where a track clearly asks for it."""
 _LARGEST_SLOPE_GAINS = {2: 1.5 * 130 / 144, 3: 1.5 * 1588 / 6048}
 """1.5 times the variance, per frame squared, of the slope in the middle of a cubic polynomial through five or seven frames with
 errors of 1. Longer windows have the second one."""
@@ -105,7 +107,7 @@ def smoother(times: Array, values: Array, variances: Array, neighbours: Neighbou
         >>> value, slope = smooth(track)
         >>> bool(np.abs(value[:, 0, 0] - np.sin(2 * np.pi * times))[5:-5].max() < 0.02)
         True
-        >>> bool(smooth.gains[100, 0, 0] < 0.5)
+        >>> bool(smooth.gains[100, 0, 0] < 0.6)
         True
     """
     frames, count = values.shape[:2]
@@ -189,7 +191,8 @@ def _longest(tried: list[tuple[Array, Array, Array]], widths: list[int]) -> NDAr
         agrees = np.ones(shape, dtype=bool)
         for (_, other, more), width in zip(tried[:number], widths, strict=False):
             ratio = np.square(estimate - other).mean(-1) / np.maximum(more - variance, 1e-9 * more)
-            agrees &= (_mean_around(ratio, width) <= _AGREEMENT**2).all(-1)
+            allowed = _CLEAR if width == HALF_WIDTHS[0] else _AGREEMENT
+            agrees &= (_mean_around(ratio, width) <= allowed**2).all(-1)
         going_on &= agrees | ~determined
         chosen = np.where(determined & (going_on | (chosen < 0)), number, chosen)
     return np.maximum(chosen, 0)
