@@ -50,6 +50,7 @@ FLOORS = [
     ["pipeline"],
     ["layer"],
     ["show"],
+    ["analysis", "video"],
     ["simulate"],
     ["benchmark.baselines"],
     ["benchmark"],

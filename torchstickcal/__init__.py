@@ -61,7 +61,7 @@ _HOMES = {
     "load_config": "config",
     "triangulate": "pipeline.triangulate",
 }
-_SUBPACKAGES = {"bridges", "io", "losses", "metrics", "simulate"}
+_SUBPACKAGES = {"analysis", "bridges", "io", "losses", "metrics", "simulate", "video"}
 
 __all__ = [
     "Calibration",

@@ -6,10 +6,12 @@ import argparse
 from pathlib import Path
 from typing import Any, NoReturn
 
+from torchstickcal.cli.analyse import add_analyse
 from torchstickcal.cli.benchmark import benchmark
 from torchstickcal.cli.calibrate import calibrate_session
 from torchstickcal.cli.check import check_session
 from torchstickcal.cli.convert import convert
+from torchstickcal.cli.detect import add_detect
 from torchstickcal.cli.evaluate import evaluate
 from torchstickcal.cli.info import info
 from torchstickcal.cli.listing import LISTS, list_names
@@ -56,6 +58,8 @@ def parser() -> argparse.ArgumentParser:
         _add_calibrate,
         _add_check,
         _add_triangulate,
+        add_detect,
+        add_analyse,
         _add_info,
         _add_convert,
         _add_sample,

@@ -22,6 +22,9 @@ _HAND_TO_STICK = 0.4
 _FREE_HAND = (0.05, 0.09, -0.30)
 """Position of a hand that holds nothing, relative to its shoulder: outward, forward, up; in body heights."""
 
+_HIP = 0.05
+"""Distance of a hip from the middle of the pelvis, in body heights."""
+
 _CHANNELS = [f.name for f in fields(Posture)][:-2]
 _FEET = slice(len(_CHANNELS), len(_CHANNELS) + 6)
 _VARIATION = np.array([_LENGTH_VARIATION_M if name.endswith("_m") else _ANGLE_VARIATION_DEG for name in _CHANNELS] + [0.0] * 6)
@@ -72,6 +75,20 @@ class Motion:
         times = self.tempo * np.asarray(times, dtype=np.float64)
         distinct, index = np.unique(times, return_inverse=True)
         return self._points(distinct)[index.reshape(times.shape)]
+
+    def hips(self, times: Array) -> Array:
+        """Positions of the left and the right hip joint, (T, 2, 3), metres, which are not among the points.
+
+        They are at the sides of the pelvis and turn with it. Thighs begin between them, as in the skeleton.
+        """
+        points = self.points(times)
+        times = self.tempo * np.asarray(times, dtype=np.float64)
+        pose = dict(zip(_CHANNELS, _posture(self.action, times, self.variation, self.seed).T, strict=False))
+        walk = Walk(self.path, self.laps, *self.action.walk_s, self.action.period_s)
+        turned = walk.body(times)[1] @ _trunk_rotation(pose, "pelvis")
+        aside = self.skeleton.height_m * _HIP * turned[..., 0]
+        pelvis = points[:, JOINT_INDEX["pelvis"]]
+        return np.stack([pelvis - aside, pelvis + aside], axis=1)
 
     @property
     def period_s(self) -> float:

@@ -19,8 +19,8 @@ from torchstickcal.simulate.skeleton import JOINT_INDEX, JOINTS, PARENTS
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
-_LIMB_RADII_M = {"spine": 0.12, "neck": 0.13, "head": 0.06, "head_top": 0.10, "shoulder": 0.06, "elbow": 0.045, "wrist": 0.04}
-_LIMB_RADII_M |= {"hand": 0.04, "knee": 0.08, "shin": 0.055, "ankle": 0.05}
+LIMB_RADII_M = {"spine": 0.12, "neck": 0.13, "head": 0.06, "head_top": 0.10, "shoulder": 0.06, "elbow": 0.045, "wrist": 0.04}
+LIMB_RADII_M |= {"hand": 0.04, "knee": 0.08, "shin": 0.055, "ankle": 0.05}
 _MIN_DISTANCE_BEHIND_M = 0.10
 _MIRRORED = [
     JOINT_INDEX[name.replace("left", "right") if name.startswith("left") else name.replace("right", "left")] for name in JOINTS
@@ -291,7 +291,7 @@ def occluded(centre: Array, points: Array) -> Mask:
     hidden = np.zeros(points.shape[:2], dtype=bool)
     for joint, parent in PARENTS.items():
         start, end = JOINT_INDEX[parent], JOINT_INDEX[joint]
-        radius = _LIMB_RADII_M[joint.removeprefix("left_").removeprefix("right_")]
+        radius = LIMB_RADII_M[joint.removeprefix("left_").removeprefix("right_")]
         distance, share = _ray_to_segment(rays, points[:, None, start] - centre, points[:, None, end] - centre)
         in_front = (distance < radius) & ((1 - share) * ranges > _MIN_DISTANCE_BEHIND_M + radius)
         in_front[:, [start, end]] = False

@@ -133,31 +133,68 @@ def point_covariances(
         cameras: intrinsics of the C cameras.
         covariance: covariance of the cameras' tangents, (6 (C - 1), 6 (C - 1)).
     """
-    covariances = points.new_empty(len(points), 3, 3)
+    _, triangulation, by_tangents = triangulation_terms(points, visible, sigma_px, poses, cameras)
+    return triangulation + by_tangents @ covariance @ by_tangents.mT
+
+
+def triangulation_terms(
+    points: Tensor,
+    visible: Tensor,
+    sigma_px: Tensor,
+    poses: tuple[Tensor, Tensor],
+    cameras: Intrinsics,
+    pixels: Tensor | None = None,
+) -> tuple[Tensor, Tensor, Tensor]:
+    """How points follow from keypoints and cameras, to first order. NaN for points that fewer than two cameras see.
+
+    Args:
+        points: (N, 3), metres. visible, sigma_px, poses, cameras: as of :func:`point_covariances`.
+        pixels: (C, N, 2), keypoints; None for the points' own projections.
+
+    Returns:
+        The steps (N, 3) to the points that fit the keypoints best, zero without keypoints; the covariances (N, 3, 3) that the
+        keypoints' noise gives; and the derivatives (N, 3, 6 (C - 1)) with respect to the cameras' tangents.
+    """
+    tangents = 6 * (len(poses[0]) - 1)
+    found = points.new_empty(len(points), 3), points.new_empty(len(points), 3, 3), points.new_empty(len(points), 3, tangents)
     for first in range(0, len(points), _CHUNK_POINTS):
         part = slice(first, first + _CHUNK_POINTS)
-        covariances[part] = _chunk_covariances(
-            points[part].mT[None], visible[:, part], sigma_px[part], poses, cameras, covariance
-        )
-    return covariances.where(((visible.sum(0) >= 2) & points.isfinite().all(1))[:, None, None], torch.nan)
+        of_part = None if pixels is None else pixels[:, part]
+        terms = _chunk_terms(points[part].mT[None], visible[:, part], sigma_px[part], poses, cameras, of_part)
+        for whole, term in zip(found, terms, strict=True):
+            whole[part] = term
+    known = (visible.sum(0) >= 2) & points.isfinite().all(1)
+    steps, covariances, by_tangents = found
+    return (
+        steps.where(known[:, None], torch.nan),
+        covariances.where(known[:, None, None], torch.nan),
+        by_tangents.where(known[:, None, None], torch.nan),
+    )
 
 
-def _chunk_covariances(
-    points: Tensor, visible: Tensor, sigma_px: Tensor, poses: tuple[Tensor, Tensor], cameras: Intrinsics, covariance: Tensor
-) -> Tensor:
-    """``H_xx^-1 + G Cov G^T`` (n, 3, 3) of points (1, 3, n), with ``G = H_xx^-1 H_xc``."""
+def _chunk_terms(
+    points: Tensor,
+    visible: Tensor,
+    sigma_px: Tensor,
+    poses: tuple[Tensor, Tensor],
+    cameras: Intrinsics,
+    pixels: Tensor | None,
+) -> tuple[Tensor, Tensor, Tensor]:
+    """``-H_xx^-1 g``, ``H_xx^-1`` and ``-H_xx^-1 H_xc`` of points (1, 3, n)."""
     rotations, translations = poses
     points = points.nan_to_num()
     points_cam = se3.moved(rotations[None], translations[None], points)
     information = (visible & (points_cam[0, :, 2] > 0)) / sigma_px.square()
-    pixels = torch.zeros_like(points_cam[:, :, :2])  # the Gauss-Newton Hessian does not depend on them
-    blocks = ReprojectionLoss().linearise(points_cam, rotations[None], pixels, information[None], cameras.batched()).hessian
+    keypoints = torch.zeros_like(points_cam[:, :, :2]) if pixels is None else pixels.movedim(-1, 1)[None].nan_to_num()
+    terms = ReprojectionLoss().linearise(points_cam, rotations[None], keypoints, information[None], cameras.batched())
+    blocks = terms.hessian  # of Gauss-Newton, which does not depend on the keypoints
     lower = cholesky(blocks.sum(1))
     rows = cross_rows(blocks[:, 1:], points).flatten(1, 2)
-    by_tangents = backward(lower[:, None], forward(lower[:, None], rows))[0]
+    by_tangents = -backward(lower[:, None], forward(lower[:, None], rows))[0]
     identity = torch.eye(3).to(points)[..., None]
-    triangulation = backward(lower[0, None], forward(lower[0, None], identity))
-    return triangulation.movedim(-1, 0) + torch.einsum("ian,ij,jbn->nab", by_tangents, covariance, by_tangents)
+    triangulation = backward(lower[0, None], forward(lower[0, None], identity)).movedim(-1, 0)
+    gradient = torch.zeros_like(points[0]) if pixels is None else terms.gradient.sum(1)[0]
+    return -(triangulation @ gradient.mT[..., None])[..., 0], triangulation, by_tangents.movedim(-1, 0).mT
 
 
 def _point_jacobian(points: Tensor) -> Tensor:

@@ -1,0 +1,240 @@
+"""Swings and their phases, from the motion of the stick alone. Each sport has rules; all of them are written in words.
+
+All rules but that of the impact use how fast the stick turns, which a walking athlete does not change.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from torchstickcal.analysis.stick import StickMotion
+from torchstickcal.errors import CalibrationError
+from torchstickcal.registry import suggestion
+
+Array = NDArray[np.float64]
+
+EVENTS = ("takeaway", "top", "impact", "finish")
+"""What divides a swing: address | backswing | downswing | follow-through."""
+
+ONSET = 0.10
+"""Share of the largest turn rate of a swing at which the downswing begins."""
+ENDED = 0.05
+"""Share of the largest turn rate of a swing at which the follow-through ends."""
+FAST_AGAIN = 0.3
+"""Share of the largest turn rate by which the stick turned faster before a moment, for that moment to be between two swings."""
+BACKSWING_DEG = 10.0
+"""How far the stick has turned from the top when the search for the takeaway begins."""
+STOPPED = 0.10
+"""Share of the largest turn rate at which a cut has been stopped."""
+SAME_ACTION = 0.6
+"""A swing's largest turn rate is at least this share of that of the fastest swing."""
+APART_S = 1.0
+"""Peaks that are nearer to each other belong to one swing: a cut and the raising of the sword before it."""
+_LONGEST_BACKSWING_S = 3.0
+
+Search = Callable[["_Swing"], float]
+
+
+@dataclass(frozen=True)
+class Sport:
+    """The rule by which the impact of a swing is found."""
+
+    rule: str
+    impact: Search
+    needs_up: bool = False
+    takeaway: float = 0.20
+    """share of the largest turn rate of the backswing at which it begins"""
+
+
+@dataclass(frozen=True, eq=False)
+class _Swing:
+    """One estimate of a swing, for the rules: all arrays (T, ...)."""
+
+    times: Array
+    rate: Array
+    tip: Array
+    speed: Array
+    up: Array | None
+    peak: int
+    takeaway_s: float
+    top_s: float
+    finish_s: float
+
+    def between(self, first_s: float, last_s: float) -> NDArray[np.intp]:
+        return np.flatnonzero((self.times >= first_s) & (self.times <= last_s))
+
+
+def _fastest(swing: _Swing) -> float:
+    frames = swing.between(swing.top_s, swing.finish_s)
+    return _lowest_at(swing.times, -swing.speed, frames)
+
+
+def _through_address(swing: _Swing) -> float:
+    at_address = at(swing.times, swing.tip, swing.takeaway_s)
+    frames = swing.between(swing.top_s, swing.finish_s)
+    return _lowest_at(swing.times, np.square(swing.tip - at_address).sum(-1), frames)
+
+
+def _lowest_point(swing: _Swing) -> float:
+    assert swing.up is not None
+    frames = swing.between(swing.top_s, swing.finish_s)
+    return _lowest_at(swing.times, swing.tip @ swing.up, frames)
+
+
+def _stopped(swing: _Swing) -> float:
+    return _falls_below(swing.times, swing.rate, swing.peak, STOPPED * swing.rate[swing.peak])
+
+
+SPORTS: dict[str, Sport] = {
+    "any": Sport("the end of the stick is fastest", _fastest),
+    "golf": Sport("the club's head is nearest to where it was at the takeaway, where the ball lies", _through_address),
+    "baseball": Sport("the end of the bat is fastest", _fastest, takeaway=0.30),
+    "hockey": Sport("the blade is lowest", _lowest_point, needs_up=True),
+    "kendo": Sport(f"the cut is stopped: the shinai turns at {STOPPED:.0%} of its largest rate", _stopped),
+}
+"""The rules for the impact by sport."""
+
+RULES = {
+    "swing": f"around each peak of the stick's turn rate of at least {SAME_ACTION:.0%} of the largest one, if no higher "
+    f"peak is within {APART_S:g} s",
+    "takeaway": "the last time before the backswing at which the stick turned at less than 20 % of the largest rate "
+    "in it (baseball, where a bat moves little before the swing: 30 %)",
+    "top": f"the last time before the peak at which the stick turned at less than {ONSET:.0%} of the peak's rate; if it never "
+    "did since the backswing, the moment at which it turned slowest",
+    "finish": f"the first time after the peak at which the stick turns at less than {ENDED:.0%} of the peak's rate",
+}
+"""The rules for the other events, the same for all sports."""
+
+
+def sport_named(name: str) -> Sport:
+    """The rules of a sport.
+
+    Raises:
+        CalibrationError: if there are none.
+    """
+    if name not in SPORTS:
+        expected = f"one of {', '.join(SPORTS)}"
+        raise CalibrationError(
+            "no rules for a sport", where="sport", got=repr(name), expected=expected, remedy=suggestion(name, SPORTS)
+        )
+    return SPORTS[name]
+
+
+def swing_peaks(times: Array, rate: Array) -> list[int]:
+    """Frames at which the stick turns fastest, one for each swing.
+
+    Example:
+        >>> times = np.arange(0, 8, 0.01)
+        >>> rate = 30 * np.exp(-((times - 2) / 0.1) ** 2) + 28 * np.exp(-((times - 6) / 0.1) ** 2)
+        >>> [float(times[peak]) for peak in swing_peaks(times, rate)]
+        [2.0, 6.0]
+    """
+    known = np.nan_to_num(rate, nan=0.0)
+    largest, peaks, taken = known.max(initial=0.0), [], np.zeros(len(known), dtype=bool)
+    while largest > 0:
+        peak = int(np.where(taken, 0.0, known).argmax())
+        if taken[peak] or known[peak] < SAME_ACTION * largest:
+            break
+        slow = known < ENDED * known[peak]
+        before, after = np.flatnonzero(slow[:peak]), np.flatnonzero(slow[peak:])
+        first, last = (before[-1] if len(before) else 0), (peak + after[0] if len(after) else len(known) - 1)
+        if all(abs(times[peak] - times[other]) >= APART_S for other in peaks):
+            peaks.append(peak)
+        taken[first : last + 1] = True
+    return sorted(peaks)
+
+
+def events_of(times: Array, motion: StickMotion, peak: int, sport: Sport, up: Array | None, number: int = 0) -> Array:
+    """The times (4,) of :data:`EVENTS` around a peak, for one of the estimates; NaN for what is not seen."""
+    rate, tip, speed = motion.turn_rate[number], motion.tip[number], motion.tip_speed[number]
+    reach = np.flatnonzero(np.abs(times - times[peak]) < 0.05)
+    peak = int(reach[np.nanargmax(rate[reach])])
+    top = _top(times, rate, peak)
+    finish = _falls_below(times, rate, peak, ENDED * rate[peak])
+    takeaway = _takeaway(times, rate, motion.tip[number] - motion.start[number], top, sport.takeaway)
+    if sport.needs_up and up is None:
+        sport = SPORTS["any"]
+    if not np.isfinite([top, finish]).all():
+        return np.array([takeaway, top, np.nan, finish])
+    impact = sport.impact(_Swing(times, rate, tip, speed, up, peak, takeaway, top, finish))
+    return np.array([takeaway, top, impact, finish])
+
+
+def _takeaway(times: Array, rate: Array, stick: Array, top_s: float, share: float) -> float:
+    """Back from the top over the backswing, to where the stick (T, 3) turned much more slowly than since."""
+    if not np.isfinite(top_s):
+        return np.nan
+    frame = int(np.searchsorted(times, top_s)) - 1
+    at_top, largest = stick[frame] / np.linalg.norm(stick[frame]), 0.0
+    cosine = (stick @ at_top) / np.linalg.norm(stick, axis=-1)
+    while frame >= 0 and times[frame] > top_s - _LONGEST_BACKSWING_S and np.isfinite(rate[frame]):
+        if largest or cosine[frame] < np.cos(np.radians(BACKSWING_DEG)):
+            largest = max(largest, rate[frame])
+        if rate[frame] < share * largest:
+            return _crossing(times, rate, frame, share * largest)
+        frame -= 1
+    return np.nan
+
+
+def _top(times: Array, rate: Array, peak: int) -> float:
+    """Back from the peak to where the stick turned slowly, or to the slowest moment before it turned fast again."""
+    slowest = peak
+    for frame in range(peak - 1, -1, -1):
+        if not np.isfinite(rate[frame]):
+            return np.nan
+        if rate[frame] < ONSET * rate[peak]:
+            return _crossing(times, rate, frame, ONSET * rate[peak])
+        if rate[frame] < rate[slowest]:
+            slowest = frame
+        if rate[frame] > rate[slowest] + FAST_AGAIN * rate[peak]:
+            return _lowest_at(times, rate, np.array([slowest]))
+    return np.nan
+
+
+def _falls_below(times: Array, values: Array, peak: int, level: float) -> float:
+    for frame in range(peak + 1, len(values)):
+        if not np.isfinite(values[frame]):
+            return np.nan
+        if values[frame] < level:
+            return _crossing(times, values, frame - 1, level)
+    return np.nan
+
+
+def _crossing(times: Array, values: Array, frame: int, level: float) -> float:
+    """The time between a frame and the next one at which values (T,) cross a level."""
+    before, after = values[frame], values[frame + 1]
+    share = (level - before) / (after - before) if after != before else 0.5
+    return float(times[frame] + share * (times[frame + 1] - times[frame]))
+
+
+def _lowest_at(times: Array, values: Array, frames: NDArray[np.intp]) -> float:
+    """The time of the lowest of values (T,) in some frames, between frames by a parabola."""
+    if not len(frames) or np.isnan(values[frames]).all():
+        return np.nan
+    frame = int(frames[np.nanargmin(values[frames])])
+    if not 0 < frame < len(values) - 1:
+        return float(times[frame])
+    before, here, after = values[frame - 1 : frame + 2]
+    bend = before - 2 * here + after
+    if not bend > 0:
+        return float(times[frame])
+    return float(times[frame] + 0.25 * (before - after) / bend * (times[frame + 1] - times[frame - 1]))
+
+
+def at(times: Array, values: Array, when: Array | float) -> Array:
+    """Values (T, ...) at times (M,) or at one time, by the cubic polynomials through the four frames around; NaN outside."""
+    asked = np.atleast_1d(np.asarray(when, dtype=np.float64))
+    count = min(4, len(times))
+    first = np.clip(np.searchsorted(times, np.nan_to_num(asked)) - 2, 0, len(times) - count)
+    index = first[:, None] + np.arange(count)
+    near = times[index]
+    apart = near[:, :, None] - near[:, None, :] + np.eye(count)
+    to = np.broadcast_to((asked[:, None] - near)[:, None, :], apart.shape)
+    weights = np.where(np.eye(count, dtype=bool), 1.0, to / apart).prod(-1)
+    weights[~((asked >= times[0]) & (asked <= times[-1]))] = np.nan
+    found = (weights.reshape(*weights.shape, *[1] * (values.ndim - 1)) * values[index]).sum(1)
+    return found if np.ndim(when) else found[0]
