@@ -12,7 +12,7 @@ import torchstickcal
 
 ROOT = Path(__file__).parents[1]
 FLOORS = [
-    ["errors", "workers", "lazy", "precision"],
+    ["errors", "workers", "processes", "lazy", "precision"],
     ["files", "shapes", "arrays"],
     ["untrusted"],
     ["registry"],
@@ -39,6 +39,7 @@ FLOORS = [
     ["layer"],
     ["show"],
     ["io"],
+    ["many"],
     ["simulate"],
     ["benchmark.baselines"],
     ["benchmark"],

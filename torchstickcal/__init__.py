@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from torchstickcal.geometry.cameras import Intrinsics
     from torchstickcal.layer.layer import CalibrationLayer
     from torchstickcal.layer.result import LayerResult
+    from torchstickcal.many import calibrate_many
     from torchstickcal.observations import Observations
     from torchstickcal.pipeline.calibrate import Callback, calibrate
     from torchstickcal.result import Calibration
@@ -46,6 +47,7 @@ _HOMES = {
     "TensorBoardMonitor": "show.tensorboard",
     "Unrolled": "solvers.gradients",
     "calibrate": "pipeline.calibrate",
+    "calibrate_many": "many",
     "config_names": "config",
     "load_config": "config",
 }
@@ -72,6 +74,7 @@ __all__ = [
     "TensorBoardMonitor",
     "Unrolled",
     "calibrate",
+    "calibrate_many",
     "config_names",
     "load_config",
 ]
