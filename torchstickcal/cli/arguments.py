@@ -8,6 +8,7 @@ from typing import Any, NoReturn
 
 from torchstickcal.cli.benchmark import benchmark
 from torchstickcal.cli.calibrate import calibrate_session
+from torchstickcal.cli.calibrate_many import calibrate_sessions
 from torchstickcal.cli.evaluate import evaluate
 from torchstickcal.cli.listing import LISTS, list_names
 from torchstickcal.cli.outputs import EXIT_UNUSABLE
@@ -33,7 +34,7 @@ def parser() -> argparse.ArgumentParser:
         description="Calibrate a camera rig, in metres, from an athlete's keypoints and a stick of known length.",
     )
     commands = parser.add_subparsers(metavar="COMMAND", required=True)
-    for add in (_add_calibrate, _add_evaluate, _add_benchmark, _add_simulate, _add_demo, _add_list):
+    for add in (_add_calibrate, _add_calibrate_many, _add_evaluate, _add_benchmark, _add_simulate, _add_demo, _add_list):
         add(commands)
     return parser
 
@@ -47,28 +48,44 @@ def _add_calibrate(commands: Any) -> None:
     _add_format(command, "SESSION")
     _add_given(command)
     _add_config(command)
-    command.add_argument(
-        "--refine",
-        metavar="A,B|auto|none",
-        help="what to estimate of the cameras beside their poses: names from `torchstickcal list unknowns`, `none`, or `auto` "
-        "for what the keypoints contradict (default: as in the configuration, else auto)",
-    )
-    command.add_argument("--no-sync", action="store_true", help="do not estimate clocks: the cameras are synchronised")
-    command.add_argument(
-        "--stick-length", metavar="M", type=float, help="length of the stick in metres (default: the session's)"
-    )
-    command.add_argument(
-        "--stick-sigma",
-        metavar="M",
-        type=float,
-        help="standard deviation of that length in metres: how well it is known (default: the session's)",
-    )
-    command.add_argument(
-        "--export", metavar="A,B", help="write the calibration also in these formats, from `torchstickcal list formats`"
-    )
+    _add_refining(command)
+    _add_export(command)
     command.add_argument("--tensorboard", metavar="DIR", type=_path, help="write a TensorBoard log of the calibration")
     _add_plugin(command)
     command.set_defaults(run=calibrate_session)
+
+
+def _add_calibrate_many(commands: Any) -> None:
+    command = commands.add_parser(
+        "calibrate-many",
+        help="calibrate many sessions, on all processors or on a cluster",
+        description="Calibrate many sessions. What the folder of results already has is not calibrated again.",
+    )
+    add = command.add_argument
+    add(
+        "sessions",
+        metavar="FOLDER|LIST",
+        type=_path,
+        nargs="+",
+        help="a folder of sessions; a list: a .txt file with a path on each line; or a session",
+    )
+    _add_out(command, "results")
+    add("--jobs", metavar="N", type=int, help="number of processes (default: one for each processor)")
+    add("--cluster", metavar="ADDRESS", help="address of a Dask scheduler that does the work, such as tcp://10.0.0.1:8786")
+    add("--shard", metavar="I/N", help="only every N-th session, from the I-th on; other runs do the others")
+    add(
+        "--memory",
+        metavar="SIZE",
+        help="what all processes may need together, such as 8GB; with --cluster what one session may need (default: any)",
+    )
+    add("--retry", action="store_true", help="try sessions again that have failed before")
+    _add_format(command, "all sessions")
+    _add_given(command)
+    _add_config(command)
+    _add_refining(command)
+    _add_export(command)
+    _add_plugin(command)
+    command.set_defaults(run=calibrate_sessions)
 
 
 def _add_evaluate(commands: Any) -> None:
@@ -196,6 +213,32 @@ def _add_given(command: argparse.ArgumentParser) -> None:
         metavar="largest|central|moving|stick|N",
         default="auto",
         help="who the athlete is, of several people (default: who is nearest to the stick of --stick-points, else the largest)",
+    )
+
+
+def _add_refining(command: argparse.ArgumentParser) -> None:
+    """What is estimated, and how well the stick is known."""
+    command.add_argument(
+        "--refine",
+        metavar="A,B|auto|none",
+        help="what to estimate of the cameras beside their poses: names from `torchstickcal list unknowns`, `none`, or `auto` "
+        "for what the keypoints contradict (default: as in the configuration, else auto)",
+    )
+    command.add_argument("--no-sync", action="store_true", help="do not estimate clocks: the cameras are synchronised")
+    command.add_argument(
+        "--stick-length", metavar="M", type=float, help="length of the stick in metres (default: the session's)"
+    )
+    command.add_argument(
+        "--stick-sigma",
+        metavar="M",
+        type=float,
+        help="standard deviation of that length in metres: how well it is known (default: the session's)",
+    )
+
+
+def _add_export(command: argparse.ArgumentParser) -> None:
+    command.add_argument(
+        "--export", metavar="A,B", help="write the calibration also in these formats, from `torchstickcal list formats`"
     )
 
 

@@ -7,6 +7,7 @@ from collections import Counter
 from collections.abc import Callable, Generator, Iterator
 from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, CancelledError, Executor, Future, wait
 from functools import partial
+from typing import Any
 
 from torchstickcal.errors import CalibrationError
 from torchstickcal.many.manifest import SessionRow
@@ -16,7 +17,7 @@ from torchstickcal.processes import WorkerProcesses
 from torchstickcal.result import Calibration
 
 Done = tuple[SessionRow, Calibration | None]
-Submit = Callable[[Callable[[Task], Done], Task], Future[Done]]
+Submit = Callable[..., Future[Any]]
 
 _ON_EXECUTORS = 256
 """Tasks that are given at a time to an executor whose size is not known."""

@@ -120,7 +120,7 @@ def calibrate_many(
     """
     jobs = _checked_jobs(jobs, executor)
     _check_shard(shard)
-    folder = None if out is None else Path(out)
+    folder = None if out is None else Path(out).absolute()
     settings = Settings(load_config(config), refine, folder, write, memory_bytes if executor else None)
     sources, total = sources_of(sessions)
     if shard is not None:

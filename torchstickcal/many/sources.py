@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence, Sized
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import cast
 
@@ -29,21 +29,25 @@ class SessionFile:
         path: file or folder of a session; or several, one for each camera.
         format: name of its format; None to recognise it by its content.
         given: what the files do not say.
+        change: called with what was read, returns what is calibrated; an object whose ``repr`` says what it does, such as a
+            dataclass.
     """
 
     path: str | Path | Sequence[str | Path]
     format: str | None = None
     given: Given | None = None
+    change: Callable[[Observations], Observations] | None = None
 
     def __call__(self) -> LoadedSession:
-        return load_session(self.path, self.format, self.given)
+        loaded = load_session(self.path, self.format, self.given)
+        return loaded if self.change is None else replace(loaded, observations=self.change(loaded.observations))
 
 
 SessionLike = str | Path | Observations | Callable[[], Observations | LoadedSession]
 """A session: its path, its observations, or a function without arguments that makes them when their turn comes.
 
-Other processes must be able to import the function: it stands at the top of a module, or is a :func:`functools.partial` of such a
-one, or a :class:`SessionFile`.
+Other processes must be able to import the function: it stands at the top of a module, or is a :func:`functools.partial` of such
+a one, or a :class:`SessionFile`.
 """
 
 
@@ -67,7 +71,7 @@ class Source:
     @property
     def options(self) -> str:
         """How the files are read, as a text that is the same for the same options."""
-        return repr((self.session.format, self.session.given)) if isinstance(self.session, SessionFile) else ""
+        return repr(replace(self.session, path="")) if isinstance(self.session, SessionFile) else ""
 
     @property
     def carried_bytes(self) -> int:
@@ -125,7 +129,12 @@ def sources_of(sessions: Mapping[str, SessionLike] | Iterable[SessionLike]) -> t
     return iter(every), len(every)
 
 
-def session_files(paths: Sequence[str | Path], format: str | None = None, given: Given | None = None) -> dict[str, SessionFile]:
+def session_files(
+    paths: Sequence[str | Path],
+    format: str | None = None,
+    given: Given | None = None,
+    change: Callable[[Observations], Observations] | None = None,
+) -> dict[str, SessionFile]:
     """The sessions of folders and lists, by their names.
 
     Args:
@@ -134,6 +143,7 @@ def session_files(paths: Sequence[str | Path], format: str | None = None, given:
             sessions counts as one, but hidden ones.
         format: name of the format of all of them; None to recognise it by the content.
         given: what the files do not say.
+        change: as of :class:`SessionFile`.
 
     Returns:
         The sessions in natural order of their names (or in that of the list). The name of a session in the only folder is its
@@ -156,7 +166,7 @@ def session_files(paths: Sequence[str | Path], format: str | None = None, given:
         for name, session in _sessions_at(path, format, alone=len(paths) == 1):
             if name in found:
                 raise _twice(name)
-            found[name] = SessionFile(session, format, given)
+            found[name] = SessionFile(session.absolute(), format, given, change)
     if not found:
         where = ", ".join(map(str, paths))
         raise CalibrationError("no sessions", where=where, got="none", expected="sessions, folders of sessions, or lists")
@@ -214,7 +224,7 @@ def _named(sessions: Mapping[str, SessionLike] | Iterable[SessionLike]) -> Itera
         if name in names:
             raise _twice(name)
         names.add(name)
-        yield Source(name, cast(SessionLike, session))
+        yield Source(name, Path(session).absolute() if isinstance(session, str | Path) else cast(SessionLike, session))
 
 
 def _twice(name: str) -> CalibrationError:
