@@ -168,7 +168,7 @@ def session_files(
                 raise _twice(name)
             found[name] = SessionFile(session.absolute(), format, given, change)
     if not found:
-        where = ", ".join(map(str, paths))
+        where = ", ".join(map(str, paths)) or "sessions"
         raise CalibrationError("no sessions", where=where, got="none", expected="sessions, folders of sessions, or lists")
     return found
 
