@@ -12,7 +12,7 @@ import torchstickcal
 
 ROOT = Path(__file__).parents[1]
 FLOORS = [
-    ["errors", "workers", "lazy", "precision", "samples"],
+    ["errors", "workers", "processes", "lazy", "precision", "samples"],
     ["files", "shapes", "arrays"],
     ["untrusted"],
     ["registry", "skeletons"],
@@ -50,7 +50,7 @@ FLOORS = [
     ["pipeline"],
     ["layer"],
     ["show"],
-    ["analysis", "video"],
+    ["analysis", "video", "many"],
     ["simulate"],
     ["benchmark.baselines"],
     ["benchmark"],

@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from torchstickcal.geometry.cameras import Intrinsics
     from torchstickcal.layer.layer import CalibrationLayer
     from torchstickcal.layer.result import LayerResult
+    from torchstickcal.many import calibrate_many
     from torchstickcal.observations import Observations
     from torchstickcal.pipeline.calibrate import Callback, calibrate
     from torchstickcal.pipeline.triangulate import triangulate
@@ -57,6 +58,7 @@ _HOMES = {
     "Verdict": "quality.verdict",
     "calibrate": "pipeline.calibrate",
     "check": "quality.check",
+    "calibrate_many": "many",
     "config_names": "config",
     "load_config": "config",
     "triangulate": "pipeline.triangulate",
@@ -89,6 +91,7 @@ __all__ = [
     "Unrolled",
     "Verdict",
     "calibrate",
+    "calibrate_many",
     "check",
     "config_names",
     "load_config",

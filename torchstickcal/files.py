@@ -75,6 +75,17 @@ def atomic_set(folder: str | Path) -> Iterator[Path]:
         shutil.rmtree(old)
 
 
+def remove_remains(folder: str | Path) -> None:
+    """Delete what processes that were killed have left of their sets in a folder into which nobody else writes now.
+
+    A set that took the place of older files only in part is kept: it is their only copy.
+    """
+    for temporary in Path(folder).glob(f"{_TEMPORARY}*"):
+        old = temporary / "old"
+        if not old.is_dir() or not any(old.iterdir()):
+            shutil.rmtree(temporary, ignore_errors=True)
+
+
 def try_writing(folder: str | Path, names: Iterable[str] = (), where: str = "--out") -> None:
     """Try whether files can be written to a folder, and leave no trace of it.
 

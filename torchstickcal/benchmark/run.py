@@ -3,18 +3,13 @@
 from __future__ import annotations
 
 import json
-import multiprocessing
 import os
-import signal
-import threading
 import time
 import typing
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
-from contextlib import contextmanager, suppress
+from concurrent.futures import as_completed
 from dataclasses import asdict, dataclass
 from functools import lru_cache, partial
-from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -28,6 +23,7 @@ from torchstickcal.benchmark.methods import Method, method
 from torchstickcal.errors import CalibrationError, FileFormatError
 from torchstickcal.files import json_text
 from torchstickcal.metrics import PoseErrors, pose_errors
+from torchstickcal.processes import WorkerProcesses
 from torchstickcal.untrusted import read_bytes
 
 ROWS_FILE = "rows.jsonl"
@@ -246,54 +242,10 @@ def _measured(
         finally:
             torch.set_num_threads(threads)
         return
-    context = multiprocessing.get_context("spawn")
-    parent, ours = context.Pipe(duplex=False)
-    processes = min(jobs, len(missing))
-    pool = ProcessPoolExecutor(processes, context, initializer=_start, initargs=(parent, prepare))
-    with parent, ours:
-        try:
-            with _without_interrupts():
-                futures = [pool.submit(measure, place, source, name) for source, name in missing]
-            for future in as_completed(futures):
-                yield future.result()
-        except BaseException:
-            ours.close()  # its processes end
-            pool.shutdown(cancel_futures=True)
-            raise
-        pool.shutdown()
-
-
-@contextmanager
-def _without_interrupts() -> Iterator[None]:
-    """A block that starts processes which do not hear Ctrl-C: this process hears it and ends them."""
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
-    handler = signal.signal(signal.SIGINT, signal.SIG_IGN)
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGINT, handler)
-
-
-def _start(parent: Connection, prepare: Callable[[], object] | None) -> None:
-    """Make a new process ready to measure.
-
-    Args:
-        parent: a pipe that the process which started this one closes, or that the operating system closes when that one ends.
-        prepare: called at the end.
-    """
-    threading.Thread(target=_end_with, args=(parent,), daemon=True).start()
-    torch.set_num_threads(1)
-    if prepare:
-        prepare()
-
-
-def _end_with(parent: Connection) -> None:
-    """End this process as soon as the other end of a pipe is closed, whatever else it is doing."""
-    with suppress(EOFError, OSError):
-        parent.recv_bytes()
-    os._exit(1)
+    with WorkerProcesses(min(jobs, len(missing)), prepare) as processes:
+        futures = [processes.submit(measure, place, source, name) for source, name in missing]
+        for future in as_completed(futures):
+            yield future.result()
 
 
 @lru_cache(maxsize=4)

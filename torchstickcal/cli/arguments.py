@@ -9,6 +9,7 @@ from typing import Any, NoReturn
 from torchstickcal.cli.analyse import add_analyse
 from torchstickcal.cli.benchmark import benchmark
 from torchstickcal.cli.calibrate import calibrate_session
+from torchstickcal.cli.calibrate_many import calibrate_sessions
 from torchstickcal.cli.check import check_session
 from torchstickcal.cli.convert import convert
 from torchstickcal.cli.detect import add_detect
@@ -56,6 +57,7 @@ def parser() -> argparse.ArgumentParser:
     commands = parser.add_subparsers(metavar="COMMAND", required=True)
     for add in (
         _add_calibrate,
+        _add_calibrate_many,
         _add_check,
         _add_triangulate,
         add_detect,
@@ -82,24 +84,8 @@ def _add_calibrate(commands: Any) -> None:
     _add_format(command, "SESSION")
     _add_given(command)
     _add_config(command)
-    command.add_argument(
-        "--refine",
-        metavar="A,B|auto|none",
-        help="what to estimate of the cameras beside their poses: names from `torchstickcal list unknowns`, `none`, or `auto` "
-        "for what the keypoints contradict (default: as in the configuration, else auto)",
-    )
-    command.add_argument("--no-sync", action="store_true", help="do not estimate clocks: the cameras are synchronised")
-    command.add_argument(
-        "--stick-length", metavar="M", type=float, help="length of the stick in metres (default: the session's)"
-    )
-    command.add_argument(
-        "--stick-sigma",
-        metavar="M",
-        type=float,
-        help="standard deviation of that length in metres: how well it is known (default: the session's)",
-    )
+    _add_refining(command)
     _add_write(command, "the calibration and its points also")
-    command.add_argument("--export", metavar="A,B", help="as --write")
     command.add_argument(
         "--world",
         metavar="camera|athlete|floor|points FILE|calibration FILE",
@@ -145,6 +131,39 @@ def _add_check(commands: Any) -> None:
     _add_strict(command)
     _add_plugin(command)
     command.set_defaults(run=check_session)
+
+
+def _add_calibrate_many(commands: Any) -> None:
+    command = commands.add_parser(
+        "calibrate-many",
+        help="calibrate many sessions, on all processors or on a cluster",
+        description="Calibrate many sessions. What the folder of results already has is not calibrated again.",
+    )
+    add = command.add_argument
+    add(
+        "sessions",
+        metavar="FOLDER|LIST",
+        type=_path,
+        nargs="+",
+        help="a folder of sessions; a list: a .txt file with a path on each line; or a session",
+    )
+    _add_out(command, "results")
+    add("--jobs", metavar="N", type=int, help="number of processes (default: one for each processor)")
+    add("--cluster", metavar="ADDRESS", help="address of a Dask scheduler that does the work, such as tcp://10.0.0.1:8786")
+    add("--shard", metavar="I/N", help="only every N-th session, from the I-th on; other runs do the others")
+    add(
+        "--memory",
+        metavar="SIZE",
+        help="what all processes may need together, such as 8GB; with --cluster what one session may need (default: any)",
+    )
+    add("--retry", action="store_true", help="try sessions again that have failed before")
+    _add_format(command, "all sessions")
+    _add_given(command)
+    _add_config(command)
+    _add_refining(command)
+    _add_write(command, "each calibration and its points also")
+    _add_plugin(command)
+    command.set_defaults(run=calibrate_sessions)
 
 
 def _add_evaluate(commands: Any) -> None:
@@ -324,6 +343,7 @@ def _add_format(command: argparse.ArgumentParser, what: str) -> None:
 def _add_write(command: argparse.ArgumentParser, what: str) -> None:
     command.add_argument(
         "--write",
+        "--export",
         metavar="A,B",
         help=f"write {what} in these formats, from `torchstickcal list formats`, or into files whose names say their formats",
     )
@@ -367,6 +387,26 @@ def _add_recording(command: argparse.ArgumentParser) -> None:
         metavar="largest|central|moving|stick|N",
         default="auto",
         help="who the athlete is, of several people (default: who is nearest to the stick of --stick-points, else the largest)",
+    )
+
+
+def _add_refining(command: argparse.ArgumentParser) -> None:
+    """What is estimated, and how well the stick is known."""
+    command.add_argument(
+        "--refine",
+        metavar="A,B|auto|none",
+        help="what to estimate of the cameras beside their poses: names from `torchstickcal list unknowns`, `none`, or `auto` "
+        "for what the keypoints contradict (default: as in the configuration, else auto)",
+    )
+    command.add_argument("--no-sync", action="store_true", help="do not estimate clocks: the cameras are synchronised")
+    command.add_argument(
+        "--stick-length", metavar="M", type=float, help="length of the stick in metres (default: the session's)"
+    )
+    command.add_argument(
+        "--stick-sigma",
+        metavar="M",
+        type=float,
+        help="standard deviation of that length in metres: how well it is known (default: the session's)",
     )
 
 

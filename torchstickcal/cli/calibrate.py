@@ -28,8 +28,8 @@ def calibrate_session(options: argparse.Namespace) -> int:
     from torchstickcal.io import load_session
     from torchstickcal.pipeline.calibrate import calibrate
 
-    config, refine = _refining(load_config(options.config), options.refine, options.no_sync)
-    writers, world = chosen_writers(options.export, options.write), world_of(options.world, options.units)
+    config, refine = refining(load_config(options.config), options.refine, options.no_sync)
+    writers, world = chosen_writers(options.write), world_of(options.world, options.units)
     initial = initial_of(options.initial)
     try_writing(options.out, result_names(writers))
     if options.tensorboard is not None:
@@ -37,7 +37,7 @@ def calibrate_session(options: argparse.Namespace) -> int:
     session = load_session(options.session, options.format, given_of(options))
     for note in session.notes:
         print(f"note: {note}", file=sys.stderr)
-    observations = _with_stick(session.observations, options.stick_length, options.stick_sigma)
+    observations = with_stick(session.observations, options.stick_length, options.stick_sigma)
     check_frame_rate(writers, observations)
     calibration = calibrate(observations, config, Progress(_monitor(options.tensorboard)), refine, initial=initial)
     if options.split_moved and (split := _split(observations, calibration)) is not None:
@@ -110,7 +110,7 @@ def _provenance(options: argparse.Namespace, notes: Sequence[str]) -> dict[str, 
     }
 
 
-def _refining(config: Config, option: str | None, no_sync: bool) -> tuple[Config, Any]:
+def refining(config: Config, option: str | None, no_sync: bool) -> tuple[Config, Any]:
     """The configuration, and what to refine instead of what it says; None to do as it says.
 
     Raises:
@@ -135,7 +135,7 @@ def _refining(config: Config, option: str | None, no_sync: bool) -> tuple[Config
     return (replace(config, synchronise=False) if no_sync else config), refine
 
 
-def _with_stick(observations: Observations, length_m: float | None, sigma_m: float | None) -> Observations:
+def with_stick(observations: Observations, length_m: float | None, sigma_m: float | None) -> Observations:
     """The observations with another length of their stick, and another standard deviation of it.
 
     Raises:

@@ -99,7 +99,7 @@ LISTS: dict[str, tuple[str, Callable[[], Iterator[tuple[str, str]]]]] = {
     "losses": ("keys in the table of a stage of a configuration", _losses),
     "unknowns": ("for --refine, and the key `refine` of a configuration", _unknowns),
     "findings": ("families of what is found of a calibration, for its verdict", _findings),
-    "formats": ("files that can be read (--format takes those of sessions and keypoints) and written (--export)", _formats),
+    "formats": ("files that can be read (--format takes those of sessions and keypoints) and written (--write)", _formats),
     "sports": ("for simulate", _sports),
     "presets": ("sets of sessions, for simulate and benchmark", _presets),
     "baselines": ("other methods of calibration, for benchmark --methods", _baselines),

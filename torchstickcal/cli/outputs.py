@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -22,20 +22,16 @@ CAMERAS_FORMAT = "pose2sim"
 CAMERAS_FILE, POINTS_FILE, REPORT_FILE = "calibration.toml", "points.npz", "report.json"
 
 
-def chosen_writers(export: str | None = None, write: str | None = None) -> dict[str, Writer]:
+def chosen_writers(names: str | None = None) -> dict[str, Writer]:
     """The writers of the camera file and of further outputs, by the names of the files (or folders) that they write.
 
     Args:
-        export: names of formats, or of files whose names say their formats, with commas.
-        write: the same.
+        names: of formats, or of files whose names say their formats, with commas.
 
     Raises:
         CalibrationError: for an unknown format, or if two files have the same name.
     """
-    chosen = {CAMERAS_FORMAT: "--write"}
-    for option, names in (("--export", export), ("--write", write)):
-        chosen |= dict.fromkeys(names.split(",") if names else (), option)
-    return _distinct(chosen, {POINTS_FILE, REPORT_FILE})
+    return _distinct(dict.fromkeys([CAMERAS_FORMAT, *(names.split(",") if names else ())]), {POINTS_FILE, REPORT_FILE})
 
 
 def point_writers(names: str | None) -> dict[str, Writer]:
@@ -44,7 +40,7 @@ def point_writers(names: str | None) -> dict[str, Writer]:
     Raises:
         CalibrationError: also for a format that does not hold points.
     """
-    writers = _distinct(dict.fromkeys(names.split(",") if names else ["npz"], "--write"), {REPORT_FILE})
+    writers = _distinct(dict.fromkeys(names.split(",") if names else ["npz"]), {REPORT_FILE})
     for name, writer in writers.items():
         if writer.writes != "points":
             raise CalibrationError(
@@ -53,8 +49,8 @@ def point_writers(names: str | None) -> dict[str, Writer]:
     return writers
 
 
-def _distinct(names: dict[str, str], taken: set[str]) -> dict[str, Writer]:
-    """Writers by the names of their files, of formats or files and the options that ask for them.
+def _distinct(names: Iterable[str], taken: set[str]) -> dict[str, Writer]:
+    """Writers of formats or files, by the names of their files.
 
     Raises:
         CalibrationError: for an unknown format, for a file elsewhere, or if two files have the same name.
@@ -63,18 +59,18 @@ def _distinct(names: dict[str, str], taken: set[str]) -> dict[str, Writer]:
     from torchstickcal.io import CALIBRATION_WRITERS
 
     writers: dict[str, Writer] = {}
-    for name, option in names.items():
+    for name in names:
         if name not in CALIBRATION_WRITERS and "." in name:
             if Path(name).name != name:
                 expected = "the name of a file alone, which is written to the folder of the results"
-                raise CalibrationError("a file in another folder", where=option, got=name, expected=expected)
+                raise CalibrationError("a file in another folder", where="--write", got=name, expected=expected)
             file_name, writer = writer_of(name)
         else:
             writer = CALIBRATION_WRITERS[name]
             file_name = writer.file_name
         if file_name.lower() in {other.lower() for other in (*writers, *taken)}:
             expected = "another file name"
-            raise CalibrationError("two files of one name", where=f"{option} {name}", got=file_name, expected=expected)
+            raise CalibrationError("two files of one name", where=f"--write {name}", got=file_name, expected=expected)
         writers[file_name] = writer
     return writers
 

@@ -1,0 +1,146 @@
+"""The command `calibrate-many`."""
+
+from __future__ import annotations
+
+import argparse
+import re
+import sys
+import time
+from contextlib import nullcontext
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+from textwrap import shorten
+from typing import TYPE_CHECKING, Any
+
+from torchstickcal.cli.calibrate import given_of, refining, with_stick
+from torchstickcal.cli.outputs import EXIT_DONE, EXIT_NOT_CONVERGED, chosen_writers, write_results
+from torchstickcal.cli.plugins import import_plugins
+from torchstickcal.errors import CalibrationError
+
+if TYPE_CHECKING:
+    from torchstickcal.io import Writer
+    from torchstickcal.many import SessionRow
+    from torchstickcal.observations import Observations
+    from torchstickcal.result import Calibration
+
+_UNITS = {"": 1, "K": 10**3, "M": 10**6, "G": 10**9, "T": 10**12, "Ki": 2**10, "Mi": 2**20, "Gi": 2**30, "Ti": 2**40}
+_SIZE = re.compile(r"(\d+(?:\.\d+)?)\s*([KMGT]i?)?B?")
+_SHOWN_FAILURES, _LONGEST_ERROR = 5, 250
+
+
+def calibrate_sessions(options: argparse.Namespace) -> int:
+    from torchstickcal.config import load_config
+    from torchstickcal.many import calibrate_many, session_files
+    from torchstickcal.many.cluster import cluster_executor
+    from torchstickcal.many.manifest import CONVERGED, FAILED
+    from torchstickcal.many.tables import PAGE_FILE
+
+    config, refine = refining(load_config(options.config), options.refine, options.no_sync)
+    memory_bytes, shard = _bytes(options.memory), _shard(options.shard)
+    writers = chosen_writers(options.write)
+    given = given_of(options)
+    if isinstance(given.intrinsics, str | Path):
+        given = replace(given, intrinsics=Path(given.intrinsics).absolute())
+    stick = _Stick(options.stick_length, options.stick_sigma)
+    sessions = session_files(options.sessions, options.format, given, None if stick == _Stick() else stick)
+    plugins = [str(Path(plugin).absolute()) if plugin.endswith(".py") else plugin for plugin in options.plugin]
+    with cluster_executor(options.cluster) if options.cluster else nullcontext() as executor:
+        done = calibrate_many(
+            sessions,
+            config,
+            refine,
+            executor,
+            options.out,
+            jobs=options.jobs,
+            memory_bytes=memory_bytes,
+            shard=shard,
+            retry=options.retry,
+            write=partial(_write, writers, {"config": options.config}),
+            prepare=partial(import_plugins, plugins),
+            progress=_Progress(),
+        )
+    failed = [row for row in done.rows if row.outcome == FAILED]
+    converged = sum(row.outcome == CONVERGED for row in done.rows)
+    for row in failed[:_SHOWN_FAILURES]:
+        print(f"failed: {row.name}: {shorten(str(row.error), _LONGEST_ERROR, placeholder='...')}", file=sys.stderr)
+    if len(failed) > _SHOWN_FAILURES:
+        print(f"failed: {len(failed) - _SHOWN_FAILURES} more; {options.out / PAGE_FILE} says why", file=sys.stderr)
+    print(f"{converged} of {len(done.rows)} converged, {len(failed)} failed; {options.out / PAGE_FILE} shows all")
+    return EXIT_DONE if converged == len(done.rows) else EXIT_NOT_CONVERGED
+
+
+@dataclass(frozen=True)
+class _Stick:
+    """What the options say of the stick of every session."""
+
+    length_m: float | None = None
+    sigma_m: float | None = None
+
+    def __call__(self, observations: Observations) -> Observations:
+        return with_stick(observations, self.length_m, self.sigma_m)
+
+
+def _write(
+    writers: dict[str, Writer], more: dict[str, Any], calibration: Calibration, folder: Path, provenance: dict[str, Any]
+) -> None:
+    """Write the files that `calibrate` writes."""
+    write_results(calibration, folder, writers, provenance | more)
+
+
+def _bytes(text: str | None) -> int | None:
+    """A size such as 8GB as bytes.
+
+    Raises:
+        CalibrationError: if it is none.
+    """
+    if text is None:
+        return None
+    size = _SIZE.fullmatch(text.strip())
+    if size is None:
+        raise CalibrationError("not a size", where="--memory", got=repr(text), expected="a size such as 8GB or 500MB")
+    return int(float(size[1]) * _UNITS[size[2] or ""])
+
+
+def _shard(text: str | None) -> tuple[int, int] | None:
+    """A shard such as 1/4 as two numbers.
+
+    Raises:
+        CalibrationError: if it is none.
+    """
+    if text is None:
+        return None
+    shard = re.fullmatch(r"(\d{1,9})/(\d{1,9})", text.strip(), flags=re.ASCII)
+    if shard is None:
+        raise CalibrationError("not a shard", where="--shard", got=repr(text), expected="i/n with i from 1 to n, such as 1/4")
+    return int(shard[1]), int(shard[2])
+
+
+class _Progress:
+    """One bar in a terminal, with the failures so far and the time that is left; silent elsewhere."""
+
+    def __init__(self) -> None:
+        self._live = sys.stderr.isatty()
+        self._began, self._first, self._failed = time.monotonic(), 0, 0
+
+    def __call__(self, done: int, total: int | None, row: SessionRow) -> None:
+        self._first = self._first or done
+        self._failed += row.error is not None
+        if not self._live or total is None:
+            return
+        pace = (time.monotonic() - self._began) / (done - self._first + 1)
+        bar, left = "#" * (30 * done // total), _duration(pace * (total - done))
+        line = f"[{bar:<30}] {done}/{total}, {self._failed} failed, {left} left: {row.name}"
+        print(f"\r{line:<100.100}", end="\n" if done == total else "", file=sys.stderr, flush=True)
+
+
+def _duration(seconds: float) -> str:
+    """A time as people say it.
+
+    Example:
+        >>> _duration(12), _duration(200), _duration(5000)
+        ('12 s', '3 min', '1.4 h')
+    """
+    if seconds < 100:
+        return f"{seconds:.0f} s"
+    return f"{seconds / 60:.0f} min" if seconds < 3600 else f"{seconds / 3600:.1f} h"
