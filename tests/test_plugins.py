@@ -14,6 +14,7 @@ from torchstickcal.config import config_names
 from torchstickcal.io import CALIBRATION_READERS, CALIBRATION_WRITERS, KEYPOINT_READERS, SESSION_READERS, write_npz
 from torchstickcal.losses import LOSSES
 from torchstickcal.model.unknowns import REFINEMENTS
+from torchstickcal.quality.registry import FAMILIES
 from torchstickcal.simulate import PRESETS, SPORTS, golf_session
 
 pytestmark = pytest.mark.usefixtures("own_parts")
@@ -138,7 +139,7 @@ def test_a_session_of_one_s_own_format_is_measured(plugin: str, session: Path, t
 def test_two_files_of_one_name_are_refused(plugin: str, session: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     out = tmp_path / "out"
     assert main(["calibrate", str(session), "--out", str(out), "--export", "toy_report", "--plugin", plugin]) == 2
-    assert "two files of one name (--export toy_report): got report.json" in capsys.readouterr().err
+    assert "two files of one name (--write toy_report): got report.json" in capsys.readouterr().err
     assert not out.exists()
 
 
@@ -178,6 +179,7 @@ def test_everything_that_is_registered_is_listed(plugin: str, capsys: pytest.Cap
     assert {kind: list(names) for kind, names in lists.items()} == {
         "losses": list(LOSSES),
         "unknowns": list(REFINEMENTS),
+        "findings": list(FAMILIES),
         "formats": list(dict.fromkeys([*SESSION_READERS, *KEYPOINT_READERS, *CALIBRATION_READERS, *CALIBRATION_WRITERS])),
         "sports": list(SPORTS),
         "presets": list(PRESETS),

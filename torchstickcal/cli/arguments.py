@@ -86,14 +86,7 @@ def _add_calibrate(commands: Any) -> None:
     _add_config(command)
     _add_refining(command)
     _add_write(command, "the calibration and its points also")
-    command.add_argument(
-        "--world",
-        metavar="camera|athlete|floor|points FILE|calibration FILE",
-        default="athlete",
-        help="frame of the results: of the first camera; of the athlete: z up, the origin on the floor below the feet at "
-        "first, x where the athlete faces; of the floor: z up, the origin below the first camera; of points at known places "
-        "(.csv); of another calibration of the same cameras (default: athlete, where head and ankles are known)",
-    )
+    _add_world(command)
     command.add_argument(
         "--initial", metavar="FILE", type=_path, help="calibration from whose poses to start; they may be up to scale"
     )
@@ -162,6 +155,8 @@ def _add_calibrate_many(commands: Any) -> None:
     _add_config(command)
     _add_refining(command)
     _add_write(command, "each calibration and its points also")
+    _add_world(command)
+    _add_units(command)
     _add_plugin(command)
     command.set_defaults(run=calibrate_sessions)
 
@@ -346,6 +341,17 @@ def _add_write(command: argparse.ArgumentParser, what: str) -> None:
         "--export",
         metavar="A,B",
         help=f"write {what} in these formats, from `torchstickcal list formats`, or into files whose names say their formats",
+    )
+
+
+def _add_world(command: argparse.ArgumentParser) -> None:
+    command.add_argument(
+        "--world",
+        metavar="camera|athlete|floor|points FILE|calibration FILE",
+        default="athlete",
+        help="frame of the results: of the first camera; of the athlete: z up, the origin on the floor below the feet at "
+        "first, x where the athlete faces; of the floor: z up, the origin below the first camera; of points at known places "
+        "(.csv); of another calibration of the same cameras (default: athlete, where head and ankles are known)",
     )
 
 

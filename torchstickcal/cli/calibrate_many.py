@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any
 from torchstickcal.cli.calibrate import given_of, refining, with_stick
 from torchstickcal.cli.outputs import EXIT_DONE, EXIT_NOT_CONVERGED, chosen_writers, write_results
 from torchstickcal.cli.plugins import import_plugins
+from torchstickcal.cli.world import World, placed, world_of
 from torchstickcal.errors import CalibrationError
 
 if TYPE_CHECKING:
@@ -38,7 +39,7 @@ def calibrate_sessions(options: argparse.Namespace) -> int:
 
     config, refine = refining(load_config(options.config), options.refine, options.no_sync)
     memory_bytes, shard = _bytes(options.memory), _shard(options.shard)
-    writers = chosen_writers(options.write)
+    writers, world = chosen_writers(options.write), world_of(options.world, options.units)
     given = given_of(options)
     if isinstance(given.intrinsics, str | Path):
         given = replace(given, intrinsics=Path(given.intrinsics).absolute())
@@ -56,7 +57,7 @@ def calibrate_sessions(options: argparse.Namespace) -> int:
             memory_bytes=memory_bytes,
             shard=shard,
             retry=options.retry,
-            write=partial(_write, writers, {"config": options.config}),
+            write=partial(_write, writers, world, {"config": options.config}),
             prepare=partial(import_plugins, plugins),
             progress=_Progress(),
         )
@@ -82,9 +83,17 @@ class _Stick:
 
 
 def _write(
-    writers: dict[str, Writer], more: dict[str, Any], calibration: Calibration, folder: Path, provenance: dict[str, Any]
+    writers: dict[str, Writer],
+    world: World,
+    more: dict[str, Any],
+    calibration: Calibration,
+    folder: Path,
+    provenance: dict[str, Any],
 ) -> None:
     """Write the files that `calibrate` writes."""
+    calibration, sentences = placed(calibration, world)
+    if notes := [*provenance.get("notes", []), *sentences]:
+        more = more | {"notes": notes}
     write_results(calibration, folder, writers, provenance | more)
 
 

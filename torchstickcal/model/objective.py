@@ -180,11 +180,12 @@ class Objective:
         at = self._unknowns_at(state, columns)
         deviations = torch.zeros_like(m.unknowns.by_camera(state.unknowns)).requires_grad_()
         step = torch.zeros_like(deviations).requires_grad_()
-        moved = at.at(deviations)
-        still = torch.zeros_like(points_cam)
-        slope = loss.slope(points_cam, still, moved.pixels, information, moved.cameras, moved, step)
-        (gradient,) = torch.autograd.grad(slope, step, create_graph=True)
-        rows = [torch.autograd.grad(row.sum(), (deviations, points_cam), retain_graph=True) for row in gradient.unbind(-1)]
+        with torch.autograd.graph.allow_mutation_on_saved_tensors():  # an unknown of a user may write into a copy of a matrix
+            moved = at.at(deviations)
+            still = torch.zeros_like(points_cam)
+            slope = loss.slope(points_cam, still, moved.pixels, information, moved.cameras, moved, step)
+            (gradient,) = torch.autograd.grad(slope, step, create_graph=True)
+            rows = [torch.autograd.grad(row.sum(), (deviations, points_cam), retain_graph=True) for row in gradient.unbind(-1)]
         hessian, by_points = (torch.stack(of, dim=2) for of in zip(*rows, strict=True))
         return UnknownTerms(gradient.detach(), hessian, state.rotations.mT.unsqueeze(2) @ by_points)
 
