@@ -26,7 +26,7 @@ FLOORS = [
     ["solvers.base"],
     ["solvers.elimination"],
     ["solvers"],
-    ["result", "metrics"],
+    ["result", "metrics", "bridges"],
     ["pipeline.run", "pipeline.scale"],
     ["pipeline.stage"],
     ["pipeline.initialise", "pipeline.synchronise"],
