@@ -125,6 +125,20 @@ class Measurements:
             motion=self.motion and ImageMotion(*(tensor[sessions] for tensor in self.motion)),
         )
 
+    def detached(self) -> Measurements:
+        """The same measurements without gradients."""
+        lens = self.cameras.distortion
+        return replace(
+            self,
+            pixels=self.pixels.detach(),
+            confidence=self.confidence.detach(),
+            cameras=replace(
+                self.cameras, matrix=self.cameras.matrix.detach(), distortion=None if lens is None else lens.detach()
+            ),
+            lengths_m=self.lengths_m.detach(),
+            unknowns=replace(self.unknowns, prior_sigma=self.unknowns.prior_sigma.detach()),
+        )
+
     def within(self, window: slice) -> Measurements:
         """The measurements of some frames."""
         columns = self.columns_of(window)

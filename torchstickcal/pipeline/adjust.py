@@ -20,9 +20,11 @@ from torchstickcal.model.unknowns import RigUnknowns, clock_refinements, with_re
 from torchstickcal.observations import Observations
 from torchstickcal.pipeline.focal_search import search_focal
 from torchstickcal.pipeline.initialise import initialise, triangulated
+from torchstickcal.pipeline.noise import check_noise
 from torchstickcal.pipeline.relabel import Labels, mended
 from torchstickcal.pipeline.run import Run
 from torchstickcal.pipeline.scale import check_scale, rulers
+from torchstickcal.pipeline.settle import settled
 from torchstickcal.pipeline.stage import StageResult, agreeing_cameras, run_stage
 from torchstickcal.pipeline.synchronise import (
     CLOCK_STAGE,
@@ -221,7 +223,8 @@ def begin(
         start: an earlier estimate; None to estimate the rig from nothing.
 
     Raises:
-        ConfigError: if nothing sets the scale, and if there are camera groups, but not a label for each camera.
+        ConfigError: if nothing sets the scale, if there are camera groups, but not a label for each camera, and if the noise of
+            another number of points is given.
         ObservationError: if no two cameras have a frame in common.
         RigError: if the cameras cannot be placed in one rig.
     """
@@ -229,6 +232,7 @@ def begin(
     config, frames = run.config, on_common_frames(observations, offsets_frames)
     seen = measured(frames, config)
     check_scale(seen, rulers(seen, config))
+    check_noise(config, seen.points_per_frame)
     if start is not None:
         state = _state_of(start, seen, config)
     elif observations.intrinsics_known:
@@ -260,11 +264,12 @@ def adjust_cameras(adjustment: Adjustment, run: Run, only_last: bool = False) ->
         run: what all steps share.
         only_last: whether the state is near enough to begin with the last of these stages.
     """
-    stages = list(run.camera_stages.items())
+    first, *between = run.camera_stages.items()
     if only_last:
-        return _synchronised(_through(stages[-1:], adjustment, run), run)
-    first = _relabelling(stages[:1], adjustment, run)
-    return _synchronised(_through(stages[1:], first, run), run)
+        return _with_last_camera_stage(adjustment, run)
+    if not between:
+        return _settled(_synchronised(_relabelling([first], adjustment, run), run), run)
+    return _with_last_camera_stage(_through(between[:-1], _relabelling([first], adjustment, run), run), run)
 
 
 def adjust_again(adjustment: Adjustment, run: Run, refined: Sequence[str]) -> Adjustment:
@@ -288,14 +293,21 @@ def adjust_again(adjustment: Adjustment, run: Run, refined: Sequence[str]) -> Ad
     again = replace(adjustment, refined=tuple(refined), seen=seen, measurements=measurements, state=state)
     if set(refined) - set(adjustment.refined) <= clock_refinements():
         result = again.last._replace(state=state, minimum=replace(again.last.minimum, unknowns=values))
-        return _synchronised(replace(again, results=(result,)), run)
+        return _settled(_synchronised(replace(again, results=(result,)), run), run)
     begun = replace(again, results=(), records=((),) * seen.sessions)
-    return _synchronised(_through(run.camera_stages.items(), begun, run), run)
+    *before, _ = run.camera_stages.items()
+    return _with_last_camera_stage(_through(before, begun, run), run)
 
 
-def adjust_points(adjustment: Adjustment, run: Run) -> Adjustment:
-    """The stages in which the cameras are fixed."""
-    return _through(run.point_stages.items(), adjustment, run)
+def adjust_points(adjustment: Adjustment, run: Run, roughly: bool = False) -> Adjustment:
+    """The stages in which the cameras are fixed.
+
+    Args:
+        adjustment: sessions whose cameras are estimated.
+        run: what all steps share.
+        roughly: whether it is enough to come near the minima.
+    """
+    return _through(run.point_stages.items(), adjustment, run, roughly)
 
 
 def measured(frames: CommonFrames, config: Config) -> Measurements:
@@ -314,20 +326,43 @@ def points_used(observations: Observations, config: Config) -> list[int] | None:
     return None
 
 
-def _through(stages: Iterable[tuple[str, Stage]], adjustment: Adjustment, run: Run) -> Adjustment:
+def _with_last_camera_stage(adjustment: Adjustment, run: Run) -> Adjustment:
+    """After the last stage that estimates cameras, with clocks and noise that agree with what it found."""
+    *_, last = run.camera_stages.items()
+    roughly = run.settles and not adjustment.asynchronous
+    return _settled(_synchronised(_through([last], adjustment, run, roughly), run), run)
+
+
+def _settled(adjustment: Adjustment, run: Run) -> Adjustment:
+    """With the noise as it is found where the last camera stage has ended, if that stage takes it from the data.
+
+    Where no such state is found near, the stage is first run to its end.
+    """
+    if not run.settles:
+        return adjustment
+    *_, (name, stage) = run.camera_stages.items()
+    result, found = settled(name, adjustment.measurements, adjustment.last, run)
+    if not bool(found.all()):
+        ended = run_stage(name, stage, adjustment.measurements, adjustment.state, run)
+        again = adjustment.ended(settled(name, adjustment.measurements, ended, run)[0])
+        return again.replaced(found, replace(adjustment, state=result.state, results=(result,)))
+    return replace(adjustment, state=result.state, results=(result,))
+
+
+def _through(stages: Iterable[tuple[str, Stage]], adjustment: Adjustment, run: Run, roughly: bool = False) -> Adjustment:
     """After some stages. One in which keypoints count as fewer is repeated, until what they count no longer changes.
 
     Errors that last are hidden in the cameras, as long as points with such errors determine them.
     """
     for name, stage in stages:
-        adjustment = adjustment.ended(run_stage(name, stage, adjustment.measurements, adjustment.state, run))
+        adjustment = adjustment.ended(run_stage(name, stage, adjustment.measurements, adjustment.state, run, roughly))
         before, times = torch.ones_like(adjustment.last.correlation_frames), adjustment.last.correlation_frames
         for _ in range(_MOST_ROUNDS - 1):
-            settled = ((times / before).log().abs() < _SETTLED).flatten(1).all(1)
-            if bool(settled.all()):
+            unchanged = ((times / before).log().abs() < _SETTLED).flatten(1).all(1)
+            if bool(unchanged.all()):
                 break
-            again = adjustment.ended(run_stage(name, stage, adjustment.measurements, adjustment.state, run))
-            adjustment = again.replaced(settled, adjustment)
+            again = adjustment.ended(run_stage(name, stage, adjustment.measurements, adjustment.state, run, roughly))
+            adjustment = again.replaced(unchanged, adjustment)
             before, times = times, adjustment.last.correlation_frames
     return adjustment
 

@@ -7,14 +7,15 @@ from dataclasses import replace
 import torch
 
 from torchstickcal.model.measurements import Measurements
-from torchstickcal.model.objective import Objective
 from torchstickcal.model.state import State
 from torchstickcal.pipeline.adjust import Adjustment
+from torchstickcal.pipeline.noise import HeldNoise, NoiseLevels
 from torchstickcal.pipeline.run import Run
 from torchstickcal.pipeline.scale import rulers, scale_factors
 from torchstickcal.pipeline.stage import StageResult
 from torchstickcal.solvers.gradients import GradientMode, attach
-from torchstickcal.solvers.newton import polish
+from torchstickcal.solvers.linearised import Linearised
+from torchstickcal.solvers.newton import minimum_near
 
 
 def attach_gradients(ended: Adjustment, data: Measurements, run: Run, mode: GradientMode) -> State:
@@ -31,9 +32,18 @@ def attach_gradients(ended: Adjustment, data: Measurements, run: Run, mode: Grad
     """
     state = ended.state
     for number, result in enumerate(ended.results):
+        held = HeldNoise(run.noise_of(result.stage), result.gates, result.inliers)
         kept = replace(data, confidence=data.confidence.where(result.inliers, 0.0))
         fixed = None if result.stage.cameras == "free" else state if number else result.minimum
-        state = attach(Objective(kept, result.losses), _polished(kept, result, fixed), mode, fixed)
+        levels = _levels(held, result, data, fixed if number else None)
+        state = attach(
+            held,
+            data,
+            _minimum(held, data.detached(), result, fixed, levels, ended.measurements.pixels.dtype),
+            mode,
+            fixed,
+            levels,
+        )
         if result.stage.rescale:
             factors, _ = scale_factors(kept, state.points, rulers(kept, run.config))
             state = state.scaled(factors)
@@ -41,8 +51,45 @@ def attach_gradients(ended: Adjustment, data: Measurements, run: Run, mode: Grad
     return state.replaced(failed.to(state.points.device), ended.state)
 
 
+def _levels(held: HeldNoise, result: StageResult, data: Measurements, before: State | None) -> NoiseLevels | None:
+    """The levels of the noise that a stage reckons with; None where they are those at its own minimum.
+
+    Args:
+        held: the noise of the stage.
+        result: where the stage ended.
+        data: the measurements.
+        before: the state before the stage, with gradients; None where that is not known.
+    """
+    if not held.noise.estimated:
+        return result.noise
+    if result.stage.cameras == "free":
+        return None
+    return result.noise if before is None else held.levels(data, before)
+
+
 @torch.no_grad()
-def _polished(measurements: Measurements, result: StageResult, fixed: State | None) -> State:
-    """A stage's minimum, to rounding: a gradient is as exact as the minimum at which it is taken."""
+def _minimum(
+    held: HeldNoise,
+    data: Measurements,
+    result: StageResult,
+    fixed: State | None,
+    levels: NoiseLevels | None,
+    precision: torch.dtype,
+) -> Linearised:
+    """A stage's minimum, to rounding: a gradient is as exact as the minimum at which it is taken.
+
+    Args:
+        held: the noise of the stage.
+        data: the measurements.
+        result: where the stage ended.
+        fixed: the state with its cameras, where they were held fixed.
+        levels: of the noise; None where they are those at the minimum, and both have been found together.
+        precision: in which the stage was run.
+    """
+    if levels is None:
+        if precision != torch.float64:
+            return held.minimum_near(data, result.minimum)[0]
+        return Linearised(held.objective(data, result.noise), result.minimum, cameras_free=True)
+    objective = held.objective(data, levels)
     start = result.minimum if fixed is None else replace(fixed, points=result.minimum.points)
-    return polish(Objective(measurements, result.losses), start, cameras_free=fixed is None)
+    return minimum_near(lambda _: objective, start, cameras_free=fixed is None)[0]

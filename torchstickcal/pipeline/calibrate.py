@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal, Protocol
 
-from torchstickcal.config import Config, Refine, load_config, with_refine
+from torchstickcal.config import Config, Refine, load_config, with_noise, with_refine
 from torchstickcal.losses import LOSSES
 from torchstickcal.model.unknowns import REFINEMENTS
 from torchstickcal.observations import Observations
@@ -43,6 +43,7 @@ def calibrate(
     config: str | Path | Mapping[str, Any] | Config = "default",
     callback: Callback | None = None,
     refine: Sequence[Refine] | Literal["auto"] | None = None,
+    noise: Literal["estimated", "given"] | None = None,
 ) -> Calibration:
     """Find the extrinsics of all cameras and the 3D points, in metres, in the frame of the first camera.
 
@@ -53,6 +54,9 @@ def calibrate(
         refine: what else to estimate of the cameras, instead of what the configuration says: names of
             :data:`torchstickcal.model.unknowns.REFINEMENTS`, such as ``focal``, ``radial`` or ``time_offset``, or ``auto`` for
             what the keypoints contradict.
+        noise: whether the noise of the keypoints is ``estimated`` or ``given`` as ``sigma_px`` of the configuration, instead of
+            what the configuration says. Estimated, confidences compare keypoints of one point with each other; given, they set
+            the variance of each keypoint, ``sigma_px ** 2 / confidence``.
 
     Returns:
         The calibration. Its ``status`` says whether every stage converged; a stage that did not leaves the best state it found.
@@ -74,6 +78,8 @@ def calibrate(
     settings = load_config(config)
     if refine is not None:
         settings = with_refine(settings, refine)
+    if noise is not None:
+        settings = with_noise(settings, noise)
     return on_worker(observations.keypoints.device, _calibrated, observations, settings, callback)
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 from torchstickcal.config import Config, Stage
+from torchstickcal.pipeline.noise import StageNoise
 from torchstickcal.solvers import Listener, ignore_record
 
 
@@ -31,6 +32,16 @@ class Run:
     def point_stages(self) -> dict[str, Stage]:
         """The stages after it, in which the cameras are fixed."""
         return dict(self._stages[self._number_of_camera_stages :])
+
+    def noise_of(self, stage: Stage) -> StageNoise:
+        """The noise that a stage reckons with."""
+        return StageNoise(stage, self.config.given_sigma_px)
+
+    @property
+    def settles(self) -> bool:
+        """Whether the last camera stage takes its noise from the data, so that both have to be brought to agree."""
+        *_, stage = self.camera_stages.values()
+        return stage.cameras == "free" and self.noise_of(stage).estimated
 
     def took(self, step: str, seconds: float) -> None:
         """Add to the time of a step."""
