@@ -1,30 +1,32 @@
 """Learn from known rigs how far keypoints can be trusted, and use it on other rigs and sports.
 
-    python examples/learnt_confidence.py             # one seed
-    python examples/learnt_confidence.py --seeds 5   # the table in docs/training.md
-    torchrun --nproc-per-node 2 examples/learnt_confidence.py
+    python examples/learnt_confidence.py          # a few steps, to see it run
+    python examples/learnt_confidence.py --full   # the table in docs/training.md
+    torchrun --nproc-per-node 2 examples/learnt_confidence.py --full
 
 Cheap cameras are noisy, and run freely: each of their frames is up to 20 ms early or late. What moves fast is then wrong by
 centimetres. No label of an image shows this, because within one image nothing is wrong. But what moves fast is blurred, and
 that can be seen. The detections are simulated: three numbers for each keypoint, the length of its blur, the graininess of its
 image, and the detector's score.
 
-A head of few numbers makes confidences of these. It learns from sessions of golf and baseball in rigs with known cameras, and is
-tested on hockey and kendo, with other athletes and rigs. `joint_training.py` is the same experiment on images.
+A head of few numbers makes confidences of these. It learns from sessions of golf and baseball in rigs with known cameras, and
+is tested on hockey and kendo, with other athletes and rigs. `joint_training.py` is the same experiment on images.
 """
 
 from __future__ import annotations
 
 import argparse
+from functools import partial
 
 import numpy as np
 import torch
 from joint_training_parts.comparison import compare
 from joint_training_parts.detections import Detections
-from joint_training_parts.launch import options_of, run_seeds
+from joint_training_parts.launch import options_of, processes, repeat
+from joint_training_parts.log import watched_by
 from torch import Tensor
 
-from torchstickcal import Stick
+from torchstickcal import Stick, TensorBoardMonitor
 from torchstickcal.simulate import Lens, Motion, action
 from torchstickcal.simulate.paths import Path
 from torchstickcal.simulate.rigs import camera_rig
@@ -79,13 +81,17 @@ def _session(rng: np.random.Generator, sport: str, seed: int) -> tuple[np.ndarra
     )
 
 
-def experiment(seed: int, options: argparse.Namespace) -> dict[str, Tensor]:
-    """Errors of the camera positions in the test sessions, millimetres, by method."""
+def experiment(options: argparse.Namespace, monitor: TensorBoardMonitor | None, seed: int) -> dict[str, Tensor]:
+    """Errors of the camera positions in the test sessions, millimetres, by teacher."""
     first = 1000 * seed
     training = sessions(range(first, first + options.training), ("golf", "baseball"))
     test = sessions(range(first + 500, first + 500 + options.test), ("hockey", "kendo"))
-    return compare(training, test, STICK, SIGMA_PX, options.steps, seed)
+    errors, _ = compare(training, test, STICK, SIGMA_PX, options.steps, seed, watched_by(monitor, seed))
+    return errors
 
 
 if __name__ == "__main__":
-    run_seeds(experiment, options_of(__doc__, training=16, test=12, steps=40))
+    chosen = options_of(__doc__, training=(4, 16), test=(2, 12), steps=(1, 30), seeds=(1, 5))
+    with processes():
+        log = TensorBoardMonitor(chosen.logdir) if chosen.logdir else None
+        repeat(partial(experiment, chosen, log), chosen.seeds)

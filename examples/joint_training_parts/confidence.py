@@ -17,8 +17,8 @@ TOGETHER = 4
 """Sessions of a step, of all processes together."""
 _LEAST_CONFIDENCE = 1e-3
 _FREEDOM = 3.0
-Watch = Callable[[int, Tensor, Tensor, LayerResult], None]
-"""Gets the step, the loss, the confidences and the result."""
+Watch = Callable[[int, Tensor, Detections, Tensor, LayerResult], None]
+"""Gets the step, the loss, the sessions of the step, their confidences and the result."""
 
 
 class Head(nn.Module):
@@ -62,7 +62,9 @@ def learn_likelihood(head: Head, found: Detections, target: Tensor, sigma_px: fl
         optimiser.step()
 
 
-def learn_end_to_end(head: Head, found: Detections, layer: CalibrationLayer, steps: int, seed: int, watch: Watch | None) -> None:
+def learn_end_to_end(
+    head: Head, found: Detections, layer: CalibrationLayer, steps: int, seed: int, watch: Watch | None
+) -> None:
     """Train a head so that the cameras that the layer finds are where they truly are.
 
     Under torchrun each process takes its share of the sessions of a step.
@@ -82,4 +84,4 @@ def learn_end_to_end(head: Head, found: Detections, layer: CalibrationLayer, ste
         optimiser.step()
         schedule.step()
         if watch:
-            watch(step, loss, confidence, result)
+            watch(step, loss, batch, confidence, result)

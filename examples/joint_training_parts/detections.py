@@ -44,9 +44,13 @@ def reprojections(found: Detections) -> Tensor:
     Each view counts for less, the farther its keypoint is from the last reprojection.
     """
     poses = torch.cat([found.rotations, found.translations[..., None]], -1)[:, :, None, None]
-    rays = (found.keypoints - found.intrinsics[:, :, None, None, :2, 2]) / found.intrinsics[:, :, None, None, :2, :2].diagonal(dim1=-2, dim2=-1)
+    rays = (found.keypoints - found.intrinsics[:, :, None, None, :2, 2]) / found.intrinsics[:, :, None, None, :2, :2].diagonal(
+        dim1=-2, dim2=-1
+    )
     known = found.keypoints.isfinite().all(-1)
-    planes = (rays[..., None].nan_to_num() * poses[..., 2:, :] - poses[..., :2, :]) * known[..., None, None]  # (B, C, F, P, 2, 4)
+    planes = (rays[..., None].nan_to_num() * poses[..., 2:, :] - poses[..., :2, :]) * known[
+        ..., None, None
+    ]  # (B, C, F, P, 2, 4)
     weights = torch.ones_like(found.score)
     for _ in range(4):
         weighted = planes * weights[..., None, None]
@@ -54,7 +58,7 @@ def reprojections(found: Detections) -> Tensor:
         ridge = 1e-9 * torch.eye(3, dtype=normal.dtype)
         points = -torch.linalg.solve(normal[..., :3, :3] + ridge, normal[..., :3, 3])
         local = (poses[..., :3] @ points[:, None, ..., None])[..., 0] + poses[..., 3]
-        image = (local @ found.intrinsics[:, :, None].mT)
+        image = local @ found.intrinsics[:, :, None].mT
         image = image[..., :2] / image[..., 2:]
         squared = (image - found.keypoints).square().sum(-1).nan_to_num()
         weights = (1 / (1 + squared / 25)) / local[..., 2].square()

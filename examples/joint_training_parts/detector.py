@@ -7,11 +7,12 @@ from collections.abc import Callable
 
 import torch
 import torch.distributed as dist
-from joint_training_parts.detections import Detections
-from joint_training_parts.scenes import POINTS, SIZE, Sessions
 from torch import Tensor, nn
 from torch.nn import functional
 from torch.nn.parallel import DistributedDataParallel
+
+from joint_training_parts.detections import Detections
+from joint_training_parts.scenes import POINTS, SIZE, Sessions
 
 CROPS_A_STEP = 32
 _CELL_PX, _NEAR = 2, 3
@@ -41,7 +42,9 @@ class Detector(nn.Module):
         return self.heat(joined), joined
 
 
-def learn_keypoints(detector: Detector, sessions: Sessions, steps: int, watch: Callable[[int, Tensor], None] | None = None) -> None:
+def learn_keypoints(
+    detector: Detector, sessions: Sessions, steps: int, watch: Callable[[int, Tensor], None] | None = None
+) -> None:
     """Train a detector on labels. Under torchrun each process takes its share of the crops of a step.
 
     Args:
@@ -55,8 +58,9 @@ def learn_keypoints(detector: Detector, sessions: Sessions, steps: int, watch: C
     crops, labels = sessions.images.flatten(0, 2), sessions.in_crops(sessions.labels).flatten(0, 2)
     optimiser = torch.optim.AdamW(model.parameters(), 5e-3)
     schedule = torch.optim.lr_scheduler.OneCycleLR(optimiser, 5e-3, total_steps=steps)
+    order = torch.Generator().manual_seed(0)
     for step in range(steps):
-        chosen = torch.randint(len(crops), (CROPS_A_STEP,))[rank::processes]
+        chosen = torch.randint(len(crops), (CROPS_A_STEP,), generator=order)[rank::processes]
         turned, target = _turned(crops[chosen].float(), labels[chosen])
         loss = _loss(model(turned)[0], target)
         optimiser.zero_grad()
@@ -103,7 +107,7 @@ def _read(logits: Tensor, features: Tensor) -> tuple[Tensor, Tensor, Tensor]:
 
 
 def _loss(logits: Tensor, target: Tensor) -> Tensor:
-    """Cross entropy of the heat maps with spots around the labels (N, P, 2), and the distance of their means from the labels."""
+    """Cross entropy of heat maps with spots around the labels (N, P, 2), and the distance of their means from the labels."""
     places = _CELL_PX * torch.arange(logits.shape[-1]) + 0.5
     by_x, by_y = ((target[..., axis, None] - places).square() / (-2 * _SPREAD_PX**2) for axis in (0, 1))
     spot = (by_x[:, :, None, :] + by_y[:, :, :, None]).flatten(2).softmax(-1)

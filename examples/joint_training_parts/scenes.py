@@ -15,10 +15,10 @@ from dataclasses import dataclass, fields
 
 import numpy as np
 import torch
-from joint_training_parts.drawing import Capsules, draw
 from kornia.filters import gaussian_blur2d
 from torch import Tensor
 
+from joint_training_parts.drawing import Capsules, draw
 from torchstickcal.simulate import Lens, Motion, action
 from torchstickcal.simulate.paths import Path
 from torchstickcal.simulate.rigs import CameraRig, camera_rig
@@ -34,7 +34,7 @@ START, END = POINTS - 2, POINTS - 1
 _CHOSEN = [JOINT_INDEX[name] for name in NAMES[:START]] + [len(JOINTS), len(JOINTS) + 1]
 _SHOULDERS, _ELBOWS, _HANDS, _KNEES, _ANKLES = ((2, 3), (4, 5), (6, 7), (8, 9), (10, 11))
 _CLOTHED = np.array([name == "pelvis" or name.endswith(("shoulder", "elbow", "knee")) for name in NAMES])
-_DISPLACED_M = 0.02
+_DISPLACED_M = 0.015
 _CHEAP, _EARLY_OR_LATE_S, _EXPOSURE_S, _CHEAP_EXPOSURE_S, _MOMENTS = 0.4, 0.02, 0.004, 0.03, 3
 _SOFT_PX, _NOISE, _CHEAP_NOISE = 0.8, 0.02, 0.05
 _BEHIND, _BEFORE = (6, 0.01, 0.06), (1, 0.02, 0.04)
@@ -80,7 +80,7 @@ def sessions(seeds: range, sports: tuple[str, ...], layouts: tuple[str, ...], *,
     Args:
         seeds: one for each session.
         sports: their sports, in turn. layouts: those of their rigs.
-        invented: whether the arms are turned at random in each image, so that a detector learns more postures than two sports have.
+        invented: whether arms are turned at random in each image, so that a detector learns more postures than two sports have.
     """
     drawn = [
         _session(np.random.default_rng(seed), sports[seed % len(sports)], layouts[seed // 2 % len(layouts)], invented)
@@ -125,6 +125,7 @@ def _with_arms_turned(points: np.ndarray, rng: np.random.Generator) -> np.ndarra
     turn = np.eye(3) + np.sin(angle) * cross + (1 - np.cos(angle)) * cross @ cross
     start, end = points[..., START, :], points[..., END, :]
     points = points.copy()
+    points[..., START, :] = start - rng.uniform(0.0, 0.3, (*every, 1)) * (end - start)
     points[..., END, :] = start + rng.uniform(0.7, 1.8, (*every, 1)) * (end - start)
     arms, chest = [*_ELBOWS, *_HANDS, START, END], points[..., list(_SHOULDERS), :].mean(-2, keepdims=True)
     points[..., arms, :] = chest + (points[..., arms, :] - chest) @ turn.swapaxes(-1, -2)
@@ -170,7 +171,7 @@ def _images(
 
 @dataclass(frozen=True)
 class _Body:
-    """Limbs, trunk and stick as K capsules between points. Each has a colour of its own, so that a small network can learn it."""
+    """Limbs, trunk and stick as K capsules between points. Each has its own colour, so that a small network can learn it."""
 
     ends: Tensor
     """(K, 2), indices of points"""
@@ -189,12 +190,12 @@ class _Body:
                 (_SHOULDERS[side], 1, 0.06 * wide),
                 (_SHOULDERS[side], _ELBOWS[side], 0.05 * wide),
                 (_ELBOWS[side], _HANDS[side], 0.05),
-                (_HANDS[side], _HANDS[side], 0.05),
+                (_HANDS[side], _HANDS[side], 0.045),
                 (1, _KNEES[side], 0.065 * wide),
                 (_KNEES[side], _ANKLES[side], 0.05 * wide),
                 (_ANKLES[side], _ANKLES[side], 0.06),
             ]
-        parts += [(START, END, 0.025), (START, START, 0.05), (END, END, 0.06)]
+        parts += [(START, END, 0.025), (START, START, 0.08), (END, END, 0.06)]
         first, second, radius = zip(*parts, strict=True)
         hues = (0.382 * np.arange(len(parts)) + rng.normal(0, 0.005, len(parts))) % 1
         colours = [colorsys.hsv_to_rgb(hue, *rng.uniform(0.6, 1.0, 2)) for hue in hues]
