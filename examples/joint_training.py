@@ -42,13 +42,16 @@ def main() -> None:
     """Train the detector, then compare the teachers of its head."""
     sizes = {
         "labelled": (1, 50),
-        "training": (4, 16),
-        "test": (2, 12),
-        "steps": (1, 25),
+        "training": (1, 16),
+        "test": (1, 10),
+        "steps": (1, 20),
         "detector_steps": (3, 700),
         "seeds": (1, 5),
     }
-    options = options_of(__doc__, **sizes)
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--full", action="store_true", help="the whole experiment, not just a few steps to see it run")
+    parser.add_argument("--logdir", help="folder for TensorBoard")
+    options = options_of(parser, **sizes)
     with processes():
         monitor = TensorBoardMonitor(options.logdir) if options.logdir else None
         torch.manual_seed(0)
@@ -82,9 +85,9 @@ def experiment(
 
 def _report(monitor: TensorBoardMonitor | None, step: int, loss: Tensor) -> None:
     if monitor and monitor.writer:
-        monitor.writer.add_scalar("detector/loss", float(loss), step)
+        monitor.writer.add_scalar("detector/loss", loss.item(), step)
     if step % 50 == 0 and is_first():
-        print(f"detector, step {step}: loss {float(loss):.2f}", flush=True)
+        print(f"detector, step {step}: loss {loss.item():.2f}", flush=True)
 
 
 if __name__ == "__main__":

@@ -41,6 +41,17 @@ _NOISE_PX, _CHEAP_NOISE_PX, _BLUR_SHARE = 1.0, 3.0, 0.1
 _OUTLIERS, _OUTLIER_PX = 0.03, (25.0, 60.0)
 
 
+def main() -> None:
+    """Compare the teachers of a head."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--full", action="store_true", help="the whole experiment, not just a few steps to see it run")
+    parser.add_argument("--logdir", help="folder for TensorBoard")
+    options = options_of(parser, training=(4, 16), test=(2, 12), steps=(1, 30), seeds=(1, 5))
+    with processes():
+        monitor = TensorBoardMonitor(options.logdir) if options.logdir else None
+        repeat(partial(experiment, options, monitor), options.seeds)
+
+
 def sessions(seeds: range, sports: tuple[str, ...]) -> Detections:
     """Sessions with an athlete, a rig and errors of their own."""
     drawn = [_session(np.random.default_rng(seed), sports[seed % len(sports)], seed) for seed in seeds]
@@ -91,7 +102,4 @@ def experiment(options: argparse.Namespace, monitor: TensorBoardMonitor | None, 
 
 
 if __name__ == "__main__":
-    chosen = options_of(__doc__, training=(4, 16), test=(2, 12), steps=(1, 30), seeds=(1, 5))
-    with processes():
-        log = TensorBoardMonitor(chosen.logdir) if chosen.logdir else None
-        repeat(partial(experiment, chosen, log), chosen.seeds)
+    main()

@@ -17,6 +17,8 @@ TOGETHER = 4
 """Sessions of a step, of all processes together."""
 _LEAST_CONFIDENCE = 1e-3
 _FREEDOM = 3.0
+_RATE = 2.5
+"""By how much a step may change a logit, about: Adam changes each weight by the learning rate."""
 Watch = Callable[[int, Tensor, Detections, Tensor, LayerResult], None]
 """Gets the step, the loss, the sessions of the step, their confidences and the result."""
 
@@ -27,6 +29,9 @@ class Head(nn.Module):
     Its output z is the logit of the confidence: with the given noise sigma, the variance of a keypoint is
     ``sigma**2 (1 + exp(-z))``.
     """
+
+    mean: Tensor
+    scale: Tensor
 
     def __init__(self, training: Detections) -> None:
         super().__init__()
@@ -71,8 +76,9 @@ def learn_end_to_end(
     """
     rank, processes = (dist.get_rank(), dist.get_world_size()) if dist.is_initialized() else (0, 1)
     model = DistributedDataParallel(head) if dist.is_initialized() else head
-    optimiser = torch.optim.Adam(head.parameters(), 0.1)
-    schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, steps, 0.01)
+    rate = _RATE / found.seen.shape[-1]
+    optimiser = torch.optim.Adam(head.parameters(), rate)
+    schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, steps, rate / 10)
     order = torch.Generator().manual_seed(seed)
     for step in range(steps):
         batch = found[torch.randperm(len(found), generator=order)[:TOGETHER][rank::processes]]

@@ -7,6 +7,8 @@ from dataclasses import dataclass, fields
 import torch
 from torch import Tensor
 
+_ROUNDS, _SOFT_PX, _TINY = 4, 5.0, 1e-9
+
 
 @dataclass(frozen=True)
 class Detections:
@@ -43,23 +45,28 @@ def reprojections(found: Detections) -> Tensor:
 
     Each view counts for less, the farther its keypoint is from the last reprojection.
     """
-    poses = torch.cat([found.rotations, found.translations[..., None]], -1)[:, :, None, None]
-    rays = (found.keypoints - found.intrinsics[:, :, None, None, :2, 2]) / found.intrinsics[:, :, None, None, :2, :2].diagonal(
-        dim1=-2, dim2=-1
-    )
-    known = found.keypoints.isfinite().all(-1)
-    planes = (rays[..., None].nan_to_num() * poses[..., 2:, :] - poses[..., :2, :]) * known[
-        ..., None, None
-    ]  # (B, C, F, P, 2, 4)
-    weights = torch.ones_like(found.score)
-    for _ in range(4):
-        weighted = planes * weights[..., None, None]
-        normal = torch.einsum("bcfpik,bcfpil->bfpkl", weighted, planes)
-        ridge = 1e-9 * torch.eye(3, dtype=normal.dtype)
-        points = -torch.linalg.solve(normal[..., :3, :3] + ridge, normal[..., :3, 3])
-        local = (poses[..., :3] @ points[:, None, ..., None])[..., 0] + poses[..., 3]
-        image = local @ found.intrinsics[:, :, None].mT
-        image = image[..., :2] / image[..., 2:]
-        squared = (image - found.keypoints).square().sum(-1).nan_to_num()
-        weights = (1 / (1 + squared / 25)) / local[..., 2].square()
-    return image
+    agreed, depth = found.keypoints, torch.ones_like(found.score)
+    for _ in range(_ROUNDS):
+        squared = (agreed - found.keypoints).square().sum(-1)
+        agreed, depth = _reprojected(found, 1 / ((1 + squared / _SOFT_PX**2) * depth.square()))
+    return agreed
+
+
+def _reprojected(found: Detections, weights: Tensor) -> tuple[Tensor, Tensor]:
+    """Pixels (B, C, F, P, 2) and depths (B, C, F, P) of points that are triangulated by weighted least squares.
+
+    The residuals are distances from the rays; divided by the depth they are angles.
+    """
+    rotations, translations = found.rotations[:, :, None, None], found.translations[:, :, None, None]
+    matrices = found.intrinsics[:, :, None]
+    rays = found.keypoints - matrices[..., :2, 2, None].mT
+    rays = rays / matrices.diagonal(dim1=-2, dim2=-1)[..., None, :2]
+    across = rays[..., None] * rotations[..., 2:, :] - rotations[..., :2, :]  # (B, C, F, P, 2, 3)
+    offset = translations[..., :2] - rays * translations[..., 2:]
+    known = found.keypoints.isfinite().all(-1)[..., None]
+    weighted = across.where(known[..., None], 0.0) * weights.where(known[..., 0], 0.0)[..., None, None]
+    normal = torch.einsum("bcfpik,bcfpil->bfpkl", weighted, across.nan_to_num()) + _TINY * torch.eye(3, dtype=rays.dtype)
+    points = torch.linalg.solve(normal, torch.einsum("bcfpik,bcfpi->bfpk", weighted, offset.nan_to_num()))
+    local = (rotations @ points[:, None, ..., None])[..., 0] + translations
+    image = local @ matrices.mT
+    return image[..., :2] / image[..., 2:], local[..., 2]

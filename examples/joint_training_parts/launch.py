@@ -13,18 +13,15 @@ import torch.distributed as dist
 from torch import Tensor
 
 
-def options_of(text: str | None, **sizes: tuple[int, int]) -> argparse.Namespace:
+def options_of(parser: argparse.ArgumentParser, **sizes: tuple[int, int]) -> argparse.Namespace:
     """Options from the command line.
 
     Args:
-        text: what the program does.
-        sizes: numbers that can be chosen: of a short run, and of the whole experiment.
+        parser: with the option ``--full``.
+        sizes: further options, numbers: of a short run, and of a full one.
     """
-    parser = argparse.ArgumentParser(description=text, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--full", action="store_true", help="the whole experiment, not just a few steps to see it run")
     for name, (short, full) in sizes.items():
         parser.add_argument(f"--{name}", type=int, help=f"default: {short}, and {full} with --full")
-    parser.add_argument("--logdir", help="folder for TensorBoard")
     options = parser.parse_args()
     for name, (short, full) in sizes.items():
         if getattr(options, name) is None:

@@ -17,7 +17,7 @@ def watched_by(monitor: TensorBoardMonitor | None, seed: int) -> Watch | None:
     def watch(method: str, step: int, loss: Tensor, batch: Detections, confidence: Tensor, result: LayerResult) -> None:
         name = f"{method}, seed {seed}"
         if monitor.writer:
-            monitor.writer.add_scalar(f"loss/{name}", float(loss), step)
+            monitor.writer.add_scalar(f"loss/{name}", loss.item(), step)
         truth = (batch.rotations, batch.translations)
         monitor.layer(step, result, truth=truth, keypoints=batch.keypoints, confidence=confidence, name=name)
 

@@ -109,9 +109,9 @@ def _session(rng: np.random.Generator, sport: str, layout: str, invented: bool) 
     off_centre = torch.from_numpy(rng.uniform(-0.5, 0.5, low.shape)).float() * _MARGIN
     origin, scale = (low + high) / 2 + (off_centre - 0.5) * extent[..., None], extent / (SIZE - 1)
     images = _images(rng, rig, pixels, depth, origin, scale, cheap, loose)
-    poses = (torch.from_numpy(values) for values in (rig.intrinsics, rig.rotations, rig.translations))
+    intrinsics, rotations, translations = map(torch.from_numpy, (rig.intrinsics, rig.rotations, rig.translations))
     stick_m = torch.tensor([motion.action.stick_m], dtype=torch.float64)
-    return Sessions(images, origin, scale, labels, true, *poses, stick_m)
+    return Sessions(images, origin, scale, labels, true, intrinsics, rotations, translations, stick_m)
 
 
 def _with_arms_turned(points: np.ndarray, rng: np.random.Generator) -> np.ndarray:
