@@ -1,4 +1,4 @@
-"""What the site needs beside mkdocs: formulas without a script, the public names, and links to files that are not part of it."""
+"""What the site needs beside mkdocs: formulas without a script, the public names, and links to files outside of it."""
 
 from __future__ import annotations
 
@@ -12,6 +12,10 @@ from typing import Any
 from latex2mathml.converter import convert
 
 PACKAGE = Path(__file__).parents[2] / "torchstickcal"
+_FORMULAS = {
+    r'<span class="arithmatex">\\\((.*?)\\\)</span>': "inline",
+    r'<div class="arithmatex">\\\[(.*?)\\\]</div>': "block",
+}
 
 
 def on_page_markdown(markdown: str, **_: Any) -> str:
@@ -22,7 +26,9 @@ def on_page_markdown(markdown: str, **_: Any) -> str:
 
 def on_page_content(content: str, **_: Any) -> str:
     """Formulas become MathML, which browsers draw by themselves."""
-    content = re.sub(r'<span class="arithmatex">\\\((.*?)\\\)</span>', lambda m: _mathml(m[1], "inline"), content, flags=re.DOTALL)
+    content = re.sub(
+        r'<span class="arithmatex">\\\((.*?)\\\)</span>', lambda m: _mathml(m[1], "inline"), content, flags=re.DOTALL
+    )
     return re.sub(r'<div class="arithmatex">\\\[(.*?)\\\]</div>', lambda m: _mathml(m[1], "block"), content, flags=re.DOTALL)
 
 
