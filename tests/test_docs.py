@@ -97,10 +97,12 @@ def test_python_of_a_page_names_what_exists(page: Path):
 
 @pytest.mark.parametrize("page", RUNNABLE, ids=of)
 def test_python_of_a_page_runs(page: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """The blocks of a page run in their order, each with fresh inputs and with what the blocks before it have made."""
     monkeypatch.chdir(tmp_path)
+    names: dict[str, Any] = {}
     for block in python_blocks(page):
         observations, _ = golf_session(cameras=3, frames=40, noise=Noise(1.0))
-        names: dict[str, Any] = {"observations": observations, "stick": observations.sticks[0], "confidence": None}
+        names |= {"observations": observations, "stick": observations.sticks[0], "confidence": None}
         names |= {"keypoints": observations.keypoints.clone().requires_grad_(), "intrinsics": observations.cameras}
         exec(block, names)
 
@@ -145,6 +147,13 @@ def test_each_question_has_an_answer_with_a_link():
     questions = re.findall(r"^(\d+)\. (.*(?:\n    ?.*)*)", text, flags=re.MULTILINE)
     assert [int(number) for number, _ in questions] == list(range(1, 31))
     assert [number for number, question in questions if "](" not in question] == []
+
+
+def test_each_finding_has_a_remedy():
+    text = (ROOT / "docs" / "good.md").read_text("utf-8")
+    sources = "".join(file.read_text("utf-8") for file in (PACKAGE / "quality").rglob("*.py"))
+    codes = set(re.findall(r'Finding\(\s*"([a-z_]+)"', sources))
+    assert [code for code in sorted(codes) if f"`{code}`" not in text] == []
 
 
 def test_each_page_is_in_the_navigation_of_the_site():
