@@ -18,6 +18,8 @@ if TYPE_CHECKING:
     from torchstickcal.layer.result import LayerResult
     from torchstickcal.observations import Observations
     from torchstickcal.pipeline.calibrate import Callback, calibrate
+    from torchstickcal.pipeline.triangulate import triangulate
+    from torchstickcal.reconstruction import Reconstruction
     from torchstickcal.result import Calibration
     from torchstickcal.show.tensorboard import TensorBoardMonitor
     from torchstickcal.solvers.gradients import GaussNewton, GradientMode, Implicit, Unrolled
@@ -41,6 +43,7 @@ _HOMES = {
     "LayerResult": "layer.result",
     "ObservationError": "errors",
     "Observations": "observations",
+    "Reconstruction": "reconstruction",
     "RigError": "errors",
     "Stick": "stick",
     "TensorBoardMonitor": "show.tensorboard",
@@ -48,6 +51,7 @@ _HOMES = {
     "calibrate": "pipeline.calibrate",
     "config_names": "config",
     "load_config": "config",
+    "triangulate": "pipeline.triangulate",
 }
 _SUBPACKAGES = {"bridges", "io", "losses", "metrics", "simulate"}
 
@@ -67,6 +71,7 @@ __all__ = [
     "LayerResult",
     "ObservationError",
     "Observations",
+    "Reconstruction",
     "RigError",
     "Stick",
     "TensorBoardMonitor",
@@ -74,6 +79,7 @@ __all__ = [
     "calibrate",
     "config_names",
     "load_config",
+    "triangulate",
 ]
 
 
