@@ -98,7 +98,7 @@ def rows(what: str) -> Iterator[Row]:
 def main() -> None:
     """Print the table."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("what", nargs="*", default=["cameras"], help=", ".join(GROUPS) + " (default: cameras)")
+    parser.add_argument("what", nargs="*", default=["path"], help=", ".join(GROUPS) + " (default: path)")
     parser.add_argument("--seeds", type=int, default=1, help="number of sessions for each line (default: 1)")
     arguments = parser.parse_args()
     for title, settings, change, keep in (row for what in arguments.what for row in rows(what)):
