@@ -151,8 +151,10 @@ def test_each_question_has_an_answer_with_a_link():
 
 def test_each_finding_has_a_remedy():
     text = (ROOT / "docs" / "good.md").read_text("utf-8")
-    sources = "".join(file.read_text("utf-8") for file in (PACKAGE / "quality").rglob("*.py"))
-    codes = set(re.findall(r'Finding\(\s*"([a-z_]+)"', sources))
+    trees = [ast.parse(file.read_text("utf-8")) for file in (PACKAGE / "quality").rglob("*.py")]
+    calls = [node for tree in trees for node in ast.walk(tree) if isinstance(node, ast.Call) and node.args]
+    first = [call.args[0] for call in calls if isinstance(call.func, ast.Name) and call.func.id == "Finding"]
+    codes = {code.value for code in first if isinstance(code, ast.Constant)}
     assert [code for code in sorted(codes) if f"`{code}`" not in text] == []
 
 
