@@ -5,7 +5,7 @@ OLDEST := .venv-oldest
 INSTALLED := $(VENV)/.installed
 SEED ?= 0
 
-.PHONY: demo test quick test-slow test-oldest fuzz lint clean
+.PHONY: demo test quick test-slow test-oldest fuzz lint docs clean
 
 # The matrices are small: one thread computes faster than several that wait for each other.
 PYTEST := OMP_NUM_THREADS=1 $(VENV)/bin/python -m pytest
@@ -35,6 +35,13 @@ lint: $(INSTALLED)
 	$(VENV)/bin/ruff format --check .
 	$(VENV)/bin/pyright
 
+docs: $(VENV)/.docs-installed
+	$(VENV)/bin/mkdocs build --strict
+
+$(VENV)/.docs-installed: $(INSTALLED)
+	$(VENV)/bin/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e ".[docs]"
+	touch $(VENV)/.docs-installed
+
 $(INSTALLED): pyproject.toml constraints.txt
 	$(PYTHON) -m venv $(VENV)
 	$(VENV)/bin/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e ".[dev]"
@@ -46,4 +53,4 @@ $(OLDEST)/.installed: pyproject.toml constraints-oldest.txt
 	touch $(OLDEST)/.installed
 
 clean:
-	rm -rf $(VENV) $(OLDEST) demo build dist *.egg-info
+	rm -rf $(VENV) $(OLDEST) demo build dist site *.egg-info

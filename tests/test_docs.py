@@ -6,8 +6,12 @@ import ast
 import dataclasses
 import doctest
 import importlib
+import importlib.util
+import os
 import re
 import shlex
+import subprocess
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +27,19 @@ PROTOCOLS_AND_ERRORS = {"Callback", "GradientMode", "ConfigError", "FileFormatEr
 PACKAGE = Path(torchstickcal.__file__).parent
 ROOT = Path(__file__).parents[1]
 PAGES = sorted(page for pattern in ("*.md", "docs/**/*.md", "examples/**/*.md") for page in ROOT.glob(pattern))
-RUNNABLE = [page for page in PAGES if page.parent == ROOT / "docs" and "```python" in page.read_text("utf-8")]
+RUNNABLE = [page for page in PAGES if page.parent in (ROOT / "docs", ROOT) and "```python" in page.read_text("utf-8")]
+RUNNABLE.remove(ROOT / "CONTRIBUTING.md")  # its recipes are run by tests/test_contributing.py
+GUIDES = [page for page in PAGES if page.parent == ROOT / "docs"]
+PRIVATE_WORDS = {
+    "late (ms)": "time offset",
+    "told": "said, given or known",
+    "reckoned": "estimated or computed",
+    "resting": "held fixed",
+    "nearer": "closer",
+    "settled": "converged",
+    "data want": "keypoints suggest",
+}
+"""Words that are not those of the field, and what to write instead (docs/glossary.md)."""
 RESULTS: dict[str, type] = {"calibration": Calibration, "result": LayerResult, "focal": CameraParameter}
 """What the variables in the blocks of Python are."""
 
@@ -81,10 +97,12 @@ def test_python_of_a_page_names_what_exists(page: Path):
 
 @pytest.mark.parametrize("page", RUNNABLE, ids=of)
 def test_python_of_a_page_runs(page: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """The blocks of a page run in their order, each with fresh inputs and with what the blocks before it have made."""
     monkeypatch.chdir(tmp_path)
+    names: dict[str, Any] = {}
     for block in python_blocks(page):
         observations, _ = golf_session(cameras=3, frames=40, noise=Noise(1.0))
-        names: dict[str, Any] = {"observations": observations, "stick": observations.sticks[0], "confidence": None}
+        names |= {"observations": observations, "stick": observations.sticks[0], "confidence": None}
         names |= {"keypoints": observations.keypoints.clone().requires_grad_(), "intrinsics": observations.cameras}
         exec(block, names)
 
@@ -115,6 +133,46 @@ def test_links_of_a_page_lead_somewhere(page: Path):
         target = page.parent / file if file else page
         assert target.exists(), link
         assert not heading or heading in headings(target), link
+
+
+@pytest.mark.parametrize("page", GUIDES, ids=of)
+def test_words_of_a_page_are_those_of_the_field(page: Path):
+    text = re.sub(r"```.*?```|`[^`]*`", "", page.read_text("utf-8"), flags=re.DOTALL).lower()
+    found = {word: instead for word, instead in PRIVATE_WORDS.items() if re.search(rf"\b{re.escape(word)}(?!\w)", text)}
+    assert found == {}
+
+
+def test_each_question_has_an_answer_with_a_link():
+    text = (ROOT / "docs" / "questions.md").read_text("utf-8")
+    questions = re.findall(r"^(\d+)\. (.*(?:\n    ?.*)*)", text, flags=re.MULTILINE)
+    assert [int(number) for number, _ in questions] == list(range(1, 31))
+    assert [number for number, question in questions if "](" not in question] == []
+
+
+def test_each_finding_has_a_remedy():
+    text = (ROOT / "docs" / "good.md").read_text("utf-8")
+    trees = [ast.parse(file.read_text("utf-8")) for file in (PACKAGE / "quality").rglob("*.py")]
+    calls = [node for tree in trees for node in ast.walk(tree) if isinstance(node, ast.Call) and node.args]
+    first = [call.args[0] for call in calls if isinstance(call.func, ast.Name) and call.func.id == "Finding"]
+    codes = {code.value for code in first if isinstance(code, ast.Constant)}
+    assert [code for code in sorted(codes) if f"`{code}`" not in text] == []
+
+
+def test_each_page_is_in_the_navigation_of_the_site():
+    navigation = (ROOT / "mkdocs.yml").read_text("utf-8").partition("\nnav:\n")[2]
+    assert [of(page) for page in ROOT.glob("docs/**/*.md") if str(page.relative_to(ROOT / "docs")) not in navigation] == []
+
+
+def test_site_builds_without_a_warning(tmp_path: Path):
+    if importlib.util.find_spec("mkdocs") is None:
+        pytest.skip("mkdocs is not installed: pip install '.[docs]'")
+    build = [sys.executable, "-m", "mkdocs", "build", "--strict", "--quiet", "--site-dir", str(tmp_path)]
+    run = subprocess.run(
+        build, cwd=ROOT, env=os.environ | {"NO_MKDOCS_2_WARNING": "1"}, capture_output=True, text=True, check=False
+    )
+    assert run.returncode == 0, run.stdout + run.stderr
+    for formula in ('class="arithmatex"', "{{ api }}", "--8&lt;--"):
+        assert not [page.name for page in tmp_path.glob("*.html") if formula in page.read_text("utf-8")]
 
 
 def headings(page: Path) -> set[str]:

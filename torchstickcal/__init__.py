@@ -1,6 +1,6 @@
 """Metric extrinsic calibration of multi-camera rigs from an athlete's keypoints and a stick of known length.
 
-The way in is :func:`calibrate` on :class:`Observations` with a :class:`Stick`; the README shows it in ten lines.
+The way in is :func:`calibrate` on :class:`Observations` with a :class:`Stick`; docs/calibrate.md shows it in ten lines.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""The calibration as one story, in the steps of the README."""
+"""The calibration as one story, in the steps of docs/method.md."""
 
 from __future__ import annotations
 
