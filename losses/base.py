@@ -80,7 +80,8 @@ class Loss(nn.Module):
     def likelihood(self, sigma_px: Tensor) -> Self | None:
         """The loss as minus twice the logarithm of a normal density, for covariances; None if it is none.
 
-        A loss with a weight other than 1 is none: its sigma is not a standard deviation.
+        A loss with a weight other than 1 is none: its sigma is not a standard deviation. A robust kernel stays, so that a
+        residual that is an outlier, such as the length of a stick in a frame with a wrong end, gives no information.
 
         Args:
             sigma_px: estimated noise of each point's keypoints, (B, P).
@@ -88,7 +89,7 @@ class Loss(nn.Module):
         del sigma_px
         if self.weight != 1.0:
             return None
-        return self._with(kernel=Quadratic())
+        return self
 
     def _with(self, **attributes: Any) -> Self:
         """A copy with some attributes changed. Buffers are shared, not copied."""

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import dataclasses
 import json
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -18,13 +18,15 @@ from torchstickcal.errors import ObservationError
 from torchstickcal.files import atomic_path
 from torchstickcal.geometry import se3
 from torchstickcal.geometry.cameras import Intrinsics
+from torchstickcal.lazy import cached_property
+from torchstickcal.quality.verdict import Quality
 from torchstickcal.shapes import check_shapes
 from torchstickcal.solvers import IterationRecord, StageRecord, Stop
 from torchstickcal.solvers.uncertainty import centre_covariances, point_covariances, relative_scale_std
 from torchstickcal.stick import Stick
 from torchstickcal.untrusted import open_arrays, reading
 
-_FORMAT = "torchstickcal calibration 7"
+_FORMAT = "torchstickcal calibration 8"
 _TENSORS = {
     "rotations": "C 3 3",
     "translations": "C 3",
@@ -151,8 +153,8 @@ class Calibration:
     stages: tuple[StageRecord, ...]
     seconds: dict[str, float]
     """time of the initialisation, of the search for label errors, of each stage and in total"""
-    warnings: tuple[str, ...]
-    """what a careful user should know"""
+    judgement: Quality | Callable[[], Quality] = field(repr=False)
+    """the quality, or what gives it when it is first asked for"""
     left_out: tuple[str, ...] = ()
     """names of the cameras that share too little with the others, where only the largest part was to be calibrated. They are in
     no other part of the result."""
@@ -167,6 +169,26 @@ class Calibration:
         """``converged``, or which stage did not and why."""
         failed = [f"{stage.name}: {stage.stop}" for stage in self.stages if not stage.stop.converged]
         return "; ".join(failed) or "converged"
+
+    @cached_property
+    def quality(self) -> Quality:
+        """Whether the result can be used, and why: a verdict with findings, and errors in millimetres.
+
+        It is judged when it is first asked for, in a fraction of the time of the calibration; where something is wrong, causes
+        are tried, which takes longer.
+        """
+        quality = self.judgement if isinstance(self.judgement, Quality) else self.judgement()
+        object.__setattr__(self, "judgement", quality)  # what it was judged by need not be kept
+        return quality
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """What a careful user should know: the texts of the findings."""
+        return tuple(finding.text for finding in self.quality.findings)
+
+    def __getstate__(self) -> dict[str, Any]:
+        """What is copied and sent to other processes: the quality itself, not what it is judged by."""
+        return self.__dict__ | {"judgement": self.quality}
 
     @property
     def relabelled(self) -> Tensor:
@@ -292,7 +314,7 @@ class Calibration:
             "camera_names": self.camera_names,
             "stages": [dataclasses.asdict(stage) | {"stop": stage.stop.name} for stage in self.stages],
             "seconds": self.seconds,
-            "warnings": self.warnings,
+            "quality": self.quality.as_json(),
             "left_out": self.left_out,
         }
         with atomic_path(path) as temporary, temporary.open("wb") as file:
@@ -326,7 +348,7 @@ class Calibration:
                 camera_names=_texts(meta["camera_names"]),
                 stages=tuple(_stage_record(stage) for stage in _checked(meta["stages"], list)),
                 seconds=_numbers(meta["seconds"]),
-                warnings=_texts(meta["warnings"]),
+                judgement=Quality.from_json(_checked(meta["quality"], dict)),
                 left_out=_texts(meta["left_out"]),
             )
             counts = {"C": calibration.camera_names, "P": calibration.point_names, "S": calibration.sticks}

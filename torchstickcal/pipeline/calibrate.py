@@ -111,10 +111,10 @@ def _calibrated(
     # 5. Trajectories: with the cameras fixed, smooth each point as its noise and its motion demand.
     ended = adjust_points(adjusted, run)
 
-    # 6. Conclude: covariance, warnings, and the result in the caller's dtype.
+    # 6. Conclude: covariance, and the result in the caller's dtype. Its quality is judged when it is first asked for.
     unsynchronised = config.synchronise and "time_offset" not in ended.refined and models.unsynchronised
     run.took("total", time.perf_counter() - began)
-    calibration = conclude(ended, check, clocks, unsynchronised, left_out, run.seconds)
+    calibration = conclude(ended, check, clocks, unsynchronised, left_out, run)
     if callback:
         callback.on_end(calibration)
     return calibration

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from functools import partial
 
 import torch
 from torch import Tensor
@@ -11,8 +11,10 @@ from torchstickcal.model.correlation import error_correlation
 from torchstickcal.model.unknowns import RigEstimate, all_unknowns
 from torchstickcal.pipeline.adjust import Adjustment
 from torchstickcal.pipeline.check import CameraCheck
+from torchstickcal.pipeline.run import Run
 from torchstickcal.pipeline.synchronise import ClockEstimate, CommonFrames
-from torchstickcal.pipeline.warnings import warnings_of
+from torchstickcal.quality.evidence import Evidence
+from torchstickcal.quality.judge import judged
 from torchstickcal.result import Calibration, CameraParameter
 from torchstickcal.solvers.uncertainty import camera_covariance, likelihood, ruler_covariance
 
@@ -23,7 +25,7 @@ def conclude(
     clocks: ClockEstimate | None,
     unsynchronised: bool,
     left_out: tuple[str, ...],
-    seconds: Mapping[str, float],
+    run: Run,
 ) -> Calibration:
     """The calibration of one session.
 
@@ -33,13 +35,14 @@ def conclude(
         clocks: what a search for time offsets has found; None without one.
         unsynchronised: whether the motion contradicts the clocks, which were not estimated.
         left_out: names of the cameras that are no part of the rig.
-        seconds: time by step.
+        run: its configuration, and the time by step.
     """
     observations, frames, measurements = ended.observations[0], ended.frames[0], ended.measurements
     inliers, sigma_px = measurements.by_frame(ended.last.inliers[0]), ended.last.sigma_px[0]
     points = measurements.by_frame(ended.state.points[0]).where(inliers.any(0), torch.nan).movedim(0, -1)
     cameras = measurements.cameras_at(ended.state).to(torch.float64)[0]
-    covariance = _covariance(ended)
+    noise, ruler = _covariances(ended)
+    covariance = noise + ruler
     tangents = 6 * (measurements.num_cameras - 1)
     unknowns = _unknowns(ended, check, covariance[tangents:, tangents:])
     ends = torch.tensor([stick.ends for stick in observations.sticks], dtype=torch.long).view(-1, 2)
@@ -73,8 +76,8 @@ def conclude(
         point_names=observations.point_names,
         camera_names=observations.camera_labels,
         stages=ended.records[0],
-        seconds=dict(seconds),
-        warnings=warnings_of(ended, unknowns, clocks, unsynchronised, left_out),
+        seconds=dict(run.seconds),
+        judgement=partial(judged, Evidence(ended, unknowns, noise, ruler, clocks, unsynchronised, left_out, run.config)),
         left_out=left_out,
     )
 
@@ -95,20 +98,22 @@ def _residuals(ended: Adjustment) -> Tensor:
     return measurements.by_frame(residuals[0]).movedim(1, -1)
 
 
-def _covariance(ended: Adjustment) -> Tensor:
-    """Covariance of the cameras' tangents and further unknowns where they were estimated last; NaN if they never were.
+def _covariances(ended: Adjustment) -> tuple[Tensor, Tensor]:
+    """Covariances of the cameras' tangents and further unknowns where they were estimated last; NaN if they never were.
 
-    Nothing is known of a camera whose keypoints do not agree with those of the others.
+    The first comes from the errors of the keypoints, the second from those of the sticks' given lengths. Nothing is known of a
+    camera whose keypoints do not agree with those of the others.
     """
     last, measurements = ended.last_camera_stage, ended.measurements
     if last.stage.cameras != "free":
         size = 6 * (measurements.num_cameras - 1) + measurements.unknowns.count
-        return torch.full((size, size), torch.nan, dtype=torch.float64, device=measurements.pixels.device)
+        unknown = torch.full((size, size), torch.nan, dtype=torch.float64, device=measurements.pixels.device)
+        return unknown, unknown
     kept = measurements.keeping(last.inliers & ended.agreeing_cameras[..., None])
     sigma_px, times = ended.last.sigma_px, last.correlation_frames
     correlation = error_correlation(kept, last.state, sigma_px)
     noise = camera_covariance(likelihood(kept, last.losses, sigma_px * times.sqrt()), last.state, correlation, times)[0]
-    return noise + ruler_covariance(kept, last.state, sigma_px)
+    return noise, ruler_covariance(kept, last.state, sigma_px)
 
 
 def _unknowns(ended: Adjustment, check: CameraCheck, covariance: Tensor) -> dict[str, CameraParameter]:

@@ -1,0 +1,239 @@
+"""The acceptance test: lengths and keypoints predicted by calibrations that did not see them, in the form of VDI/VDE 2634.
+
+The frames are divided into folds. The cameras without a fold follow from those with all frames by one step of the reduced
+system, from which the fold's share is taken out. They triangulate the ends of the sticks in the frames of the fold from the
+keypoints alone: neither the length of the stick nor the smoothness of the motion takes part. The scale comes from the other
+frames.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from torchstickcal.geometry.singular import solve_information
+from torchstickcal.geometry.symmetric import cholesky, expand, forward, solve
+from torchstickcal.losses import ReprojectionLoss
+from torchstickcal.model.measurements import Measurements
+from torchstickcal.model.objective import Objective
+from torchstickcal.model.state import State
+from torchstickcal.pipeline.adjust import Adjustment
+from torchstickcal.quality.verdict import Acceptance, LengthErrors
+from torchstickcal.solvers.elimination.normal_equations import NormalEquations
+from torchstickcal.solvers.uncertainty import likelihood
+
+_FOLDS = 5
+_MOST_FRAMES = 1000
+_LEAST_LENGTHS = 5
+_TRIANGULATIONS = 2
+_SIGMAS = 1.96
+
+
+def accepted(ended: Adjustment, noise: Tensor, ruler: Tensor) -> Acceptance | None:
+    """The acceptance test of one session; None where no camera was estimated or no point is known.
+
+    Args:
+        ended: the session. Of a long one the middle is tested.
+        noise: covariance of the cameras' tangents and unknowns by the errors of the keypoints.
+        ruler: the covariance that the errors of the sticks' given lengths add. It is no part of a length's deviation from the
+            given one, but of that from the true one.
+    """
+    part = ended.within(_MOST_FRAMES)
+    kept = part.kept
+    if ended.last_camera_stage.stage.cameras != "free" or not bool(kept.active.any()):
+        return None
+    sigma_px = part.last.sigma_px
+    predictions = _predicted(part, kept, noise, ruler)
+    residual = _Residuals.of(kept, part.state, sigma_px)
+    lengths = [] if predictions is None else [p.errors(part) for p in predictions]
+    metre, share = (torch.inf, 0.0) if predictions is None else _metre(predictions)
+    return Acceptance(
+        lengths=tuple(one for one in lengths if one is not None),
+        metre_m=metre,
+        calibration_share=share,
+        reprojection_px=residual.rms_px,
+        reprojection_mrad=residual.rms_mrad,
+        ray_distance_m=residual.ray_distance_m,
+        left_out_px=residual.left_out_px,
+    )
+
+
+class Prediction(NamedTuple):
+    """The lengths of one stick, each predicted by cameras that did not see its frame, (F,); NaN where not known."""
+
+    stick: int
+    length_m: Tensor
+    by_keypoints_m: Tensor
+    """standard deviation by the keypoints"""
+    by_cameras_m: Tensor
+    """standard deviation by the cameras, without that of the stick's given length"""
+    by_calibration_m: Tensor
+    """standard deviation by the cameras, with it"""
+    ends: Tensor
+    """(2, 3, F), metres"""
+
+    def errors(self, part: Adjustment) -> LengthErrors | None:
+        """The errors as a table has them; None where there are too few lengths."""
+        known = self.length_m.isfinite()
+        if int(known.sum()) < _LEAST_LENGTHS:
+            return None
+        stick = part.measurements.sticks[self.stick].tolist()
+        given = float(part.measurements.lengths_m[0, self.stick])
+        errors = self.length_m[known] - given
+        std = (self.by_keypoints_m.square() + self.by_cameras_m.square()).sqrt()[known]
+        places = self.ends[..., known].movedim(1, -1).flatten(0, 1)
+        axes = torch.linalg.svd(places - places.mean(0), full_matrices=False).Vh
+        along = (places - places.mean(0)) @ axes.mT
+        x, y, z = (along.amax(0) - along.amin(0)).tolist()
+        return LengthErrors(
+            stick=" - ".join(map(part.observations[0].point_label, stick)),
+            given_m=given,
+            frames=len(errors),
+            largest_m=float(errors[errors.abs().argmax()]),
+            mean_m=float(errors.mean()),
+            std_m=float(errors.std()),
+            inside=float((errors.abs() <= _SIGMAS * std).double().mean()),
+            volume_m=(x, y, z),
+        )
+
+
+def _predicted(part: Adjustment, kept: Measurements, noise: Tensor, ruler: Tensor) -> list[Prediction] | None:
+    """The lengths of each stick; None without sticks among the points that take part."""
+    if not len(kept.sticks) or not bool(kept.stick_active.any()):
+        return None
+    shifts = _shifts_without_folds(part, kept)
+    ends = _only(kept, kept.sticks.flatten().unique())
+    state, step = part.state, torch.zeros_like(part.state.points)
+    loss = ReprojectionLoss(part.last.sigma_px[:, None, None])
+    system = NormalEquations(Objective(ends, {"reprojection": loss}), state, cameras_free=True)
+    for _ in range(_TRIANGULATIONS):
+        held = NormalEquations(Objective(ends, {"reprojection": loss}), state, cameras_free=False)
+        step = held.step().points
+        state = State(state.rotations, state.translations, state.points + step, state.unknowns)
+    response = ends.by_frame(system.point_response()[0])
+    points = ends.by_frame(state.points[0]).clone()
+    for frames, shift in shifts:
+        points[:, frames] += torch.einsum("k,kafp->afp", shift, response[:, :, frames])
+    lower = cholesky(system.point_hessian[0].double())
+    active = ends.by_frame(ends.active[0])
+    found: list[Prediction] = []
+    for number, (start, end) in enumerate(ends.sticks.tolist()):
+        known = active[:, start] & active[:, end]
+        along = points[..., end] - points[..., start]
+        length = along.norm(dim=0)
+        unit = along / length.clamp_min(1e-12)
+        half = ends.by_frame(lower)
+        keypoints = torch.stack([forward(half[..., p], unit).square().sum(0) for p in (start, end)]).sum(0)
+        by_tangent = torch.einsum("kaf,af->fk", response[..., end] - response[..., start], unit)
+        by_noise, by_ruler = (torch.einsum("fk,kl,fl->f", by_tangent, c, by_tangent).clamp_min(0.0) for c in (noise, ruler))
+        found.append(
+            Prediction(
+                number,
+                length.where(known, torch.nan),
+                keypoints.sqrt(),
+                by_noise.sqrt(),
+                (by_noise + by_ruler).sqrt(),
+                torch.stack([points[..., start], points[..., end]]),
+            )
+        )
+    return found
+
+
+def _shifts_without_folds(part: Adjustment, kept: Measurements) -> list[tuple[slice, Tensor]]:
+    """How far the cameras' tangents and unknowns would be elsewhere without some frames, for each fold of frames."""
+    losses, state = part.last_camera_stage.losses, part.state
+    objective = likelihood(kept, losses, part.last.sigma_px)
+    system = NormalEquations(objective, state, cameras_free=True)
+    information, gradient = system.reduced[0], system.reduced_gradient[0]
+    everything = solve_information(information, gradient)
+    bounds = [kept.frames * number // _FOLDS for number in range(_FOLDS + 1)]
+    found: list[tuple[slice, Tensor]] = []
+    for start, stop in zip(bounds, bounds[1:], strict=False):
+        if stop == start:
+            continue
+        window = slice(start, stop)
+        columns = kept.columns_of(window)
+        own = State(state.rotations, state.translations, state.points[..., columns], state.unknowns)
+        fold = NormalEquations(Objective(kept.within(window), objective.losses), own, cameras_free=True)
+        left = solve_information(information - _without_prior(fold), gradient - fold.reduced_gradient[0])
+        found.append((window, everything - left))
+    return found
+
+
+def _without_prior(fold: NormalEquations) -> Tensor:
+    """A fold's share of the reduced system: the prior of the unknowns belongs to the session."""
+    information = fold.reduced[0].clone()
+    _, _, prior = fold.objective.linearise_prior(fold.state)
+    poses = len(information) - prior.shape[1]
+    information.diagonal()[poses:] -= prior[0]
+    return information
+
+
+def _only(kept: Measurements, points: Tensor) -> Measurements:
+    """The measurements of some points alone."""
+    chosen = torch.zeros(kept.points_per_frame, dtype=torch.bool, device=kept.pixels.device)
+    chosen[points] = True
+    return kept.keeping(chosen.repeat(kept.frames))
+
+
+def _metre(predictions: list[Prediction]) -> tuple[float, float]:
+    """Half the width of the 95 % interval of a length of 1 m where the sticks were, and the calibration's share of its variance.
+
+    The error by the cameras is taken to grow with the length, as that of the scale does.
+    """
+    known = [one.length_m.isfinite() for one in predictions]
+    keypoints = torch.cat([one.by_keypoints_m[k].square() for one, k in zip(predictions, known, strict=True)]).mean()
+    relative = [(one.by_calibration_m / one.length_m)[k].square() for one, k in zip(predictions, known, strict=True)]
+    calibration = torch.cat(relative).mean()
+    total = keypoints + calibration
+    return _SIGMAS * float(total.sqrt()), float(calibration / total.clamp_min(1e-300))
+
+
+class _Residuals(NamedTuple):
+    """How far keypoints are from projections."""
+
+    rms_px: float
+    rms_mrad: float
+    ray_distance_m: float
+    left_out_px: tuple[float, ...]
+
+    @staticmethod
+    def of(kept: Measurements, state: State, sigma_px: Tensor) -> _Residuals:
+        """Of the keypoints that took part, and of each camera's keypoints to the points of all other cameras."""
+        objective = Objective(kept, {"reprojection": ReprojectionLoss(sigma_px[:, None, None])})
+        focal = kept.cameras.focal_px[0]
+        information = objective.information_of("reprojection")[0]
+        squares, left_squares, left_counts = [], torch.zeros_like(focal), torch.zeros_like(focal)
+        angles, distances = [], []
+        for columns, residuals, depth in kept.residuals(state):
+            seen = kept.visible[0][:, columns]
+            squared = residuals[0].double().square().sum(1)
+            distance = squared.sqrt() / focal[:, None]
+            squares.append(squared[seen])
+            angles.append(distance[seen])
+            distances.append((distance * depth[0])[seen])
+            terms = objective.linearise_chunk(state, columns, by_unknowns=False)["reprojection"]
+            weight = (kept.confidence[0][:, columns] * information[:, columns]).double()
+            predicted = _left_out(terms.gradient[0].double(), terms.hessian[0].double(), squared * weight)
+            usable = seen & (seen.sum(0) >= 3)
+            left_squares += (predicted / weight.clamp_min(1e-300)).where(usable, 0.0).sum(1)
+            left_counts += usable.sum(1)
+        rms_px, rms_mrad = (float(torch.cat(values).square().mean().sqrt()) for values in ([s.sqrt() for s in squares], angles))
+        left = (left_squares / left_counts).sqrt()
+        return _Residuals(rms_px, 1000 * rms_mrad, float(torch.cat(distances).median()), tuple(left.tolist()))
+
+
+def _left_out(gradients: Tensor, blocks: Tensor, squared: Tensor) -> Tensor:
+    """Squared whitened residuals (C, n) of keypoints, from points that were triangulated without them.
+
+    Args:
+        gradients: (C, 3, n), by the points.
+        blocks: (C, 6, n), Hessians by the points.
+        squared: (C, n), squared whitened residuals.
+    """
+    others = blocks.sum(0) - blocks
+    step = -solve(others, gradients.sum(0) - gradients)
+    bent = torch.einsum("cijn,cjn->cin", expand(blocks), step)
+    return (squared + 2 * (step * gradients).sum(1) + (step * bent).sum(1)).clamp_min(0.0)

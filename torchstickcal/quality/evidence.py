@@ -1,0 +1,184 @@
+"""What findings look at: one session where its calibration ended, and what is computed of it once for all of them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from torchstickcal.config import Config
+from torchstickcal.geometry import se3
+from torchstickcal.lazy import cached_property
+from torchstickcal.model.measurements import Measurements
+from torchstickcal.model.state import State
+from torchstickcal.model.unknowns import all_unknowns
+from torchstickcal.observations import Observations
+from torchstickcal.pipeline.adjust import Adjustment
+from torchstickcal.pipeline.synchronise import ClockEstimate
+from torchstickcal.quality.acceptance import accepted
+from torchstickcal.quality.linear import FramePulls
+from torchstickcal.quality.moved import Motion, motion_of
+from torchstickcal.quality.verdict import Acceptance
+from torchstickcal.result import CameraParameter
+from torchstickcal.solvers.uncertainty import centre_covariances, relative_scale_std
+
+_CONSISTENT_SHARE, _BEHIND_OTHERS, _NOISY_MRAD = 0.62, 0.85, 10.0
+"""Least share of a camera's keypoints that agree, also over that of the median camera, and noise of the keypoints, of a rig whose
+cameras see one scene. Sound cameras keep 84 % and more, with 20 % of wrong keypoints 66 %."""
+_OTHER_PERSON_SHARE = 0.2
+"""Share of a camera's frames that were set aside as those of another person, from which on the camera itself is doubted."""
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """One session where its calibration ended.
+
+    Args:
+        ended: the session.
+        unknowns: what may be unknown of the cameras, as found and as the keypoints suggest.
+        noise: covariance of the cameras' tangents and unknowns by the errors of the keypoints.
+        ruler: the covariance that the errors of the sticks' given lengths add.
+        clocks: what a search for time offsets has found; None without one.
+        unsynchronised: whether the motion contradicts the clocks, which were not estimated.
+        left_out: names of the cameras that are no part of the rig.
+        config: the configuration.
+    """
+
+    ended: Adjustment
+    unknowns: Mapping[str, CameraParameter]
+    noise: Tensor
+    ruler: Tensor
+    clocks: ClockEstimate | None
+    unsynchronised: bool
+    left_out: tuple[str, ...]
+    config: Config
+
+    @property
+    def observations(self) -> Observations:
+        """The session as it was given."""
+        return self.ended.observations[0]
+
+    @property
+    def measurements(self) -> Measurements:
+        """All keypoints that could take part, inliers and outliers."""
+        return self.ended.measurements
+
+    @cached_property
+    def kept(self) -> Measurements:
+        """The keypoints that took part to the end."""
+        return self.ended.kept
+
+    @property
+    def state(self) -> State:
+        """The estimate."""
+        return self.ended.state
+
+    @property
+    def sigma_px(self) -> Tensor:
+        """(P,), noise of each point's keypoints, pixels."""
+        return self.ended.last.sigma_px[0]
+
+    @property
+    def cameras(self) -> int:
+        """C"""
+        return self.measurements.num_cameras
+
+    def camera(self, index: int) -> str:
+        """The name of a camera."""
+        return self.observations.camera_label(index)
+
+    def point(self, index: int) -> str:
+        """The name of a point."""
+        return self.observations.point_label(index)
+
+    def named(self, cameras: Sequence[int]) -> str:
+        """The names of some cameras."""
+        return ", ".join(map(self.camera, cameras))
+
+    @cached_property
+    def agreement(self) -> Tensor:
+        """(C,), share of each camera's keypoints that agree with the other cameras; 1 where it has none."""
+        seen, kept = (m.visible[0].sum(-1).double() for m in (self.measurements, self.kept))
+        return (kept / seen.clamp_min(1)).where(seen > 0, 1.0)
+
+    @cached_property
+    def consistent(self) -> bool:
+        """Whether all cameras agree with each other as those of one scene do, so that small errors can be told by linearising."""
+        least, median = float(self.agreement.min()), float(self.agreement.median())
+        agree = least > max(_CONSISTENT_SHARE, _BEHIND_OTHERS * median)
+        person = float(self.ended.labels.other_person[0].double().mean(1).max()) < _OTHER_PERSON_SHARE
+        return self.ended.converged and agree and person and self.noise_mrad < _NOISY_MRAD
+
+    @cached_property
+    def centres(self) -> Tensor:
+        """(C, 3), the cameras' centres, metres."""
+        return se3.camera_centres(self.state.rotations[0], self.state.translations[0])
+
+    @cached_property
+    def centre_std_m(self) -> Tensor:
+        """(C,), standard deviation of each camera's centre, metres; NaN where cameras were not estimated."""
+        return centre_covariances(self.centres, self._pose_covariance).diagonal(dim1=1, dim2=2).sum(1).sqrt()
+
+    @cached_property
+    def scale_std(self) -> float:
+        """Standard deviation of the rig's scale, as a share of it."""
+        return float(relative_scale_std(self.centres, self._pose_covariance))
+
+    @property
+    def _pose_covariance(self) -> Tensor:
+        poses = slice(0, 6 * (self.cameras - 1))
+        return (self.noise + self.ruler)[poses, poses]
+
+    @cached_property
+    def rig_m(self) -> float:
+        """Largest distance between two cameras, metres."""
+        return float(torch.cdist(self.centres, self.centres).max())
+
+    @cached_property
+    def noise_mrad(self) -> float:
+        """Median noise of the keypoints, as an angle."""
+        return 1000 * float(self.sigma_px.median() / self.measurements.cameras.focal_px.mean())
+
+    @cached_property
+    def points(self) -> Tensor:
+        """(3, F, P), metres; NaN where a point is not known."""
+        known = self.kept.active[0]
+        return self.measurements.by_frame(self.state.points[0].where(known, torch.nan))
+
+    @cached_property
+    def motion(self) -> Motion | None:
+        """The most evident change of a camera's pose during the session; None where nothing can be said."""
+        if self.cameras < 2 or not bool(self.kept.active.any()):
+            return None
+        pulls = FramePulls.of(self.measurements, self.state, self.ended.last.sigma_px)
+        return motion_of(pulls, self.state.rotations[0], self.state.translations[0])
+
+    @cached_property
+    def contradictions(self) -> dict[str, Tensor]:
+        """(C,), by the name of what may be unknown of the cameras: squared length, in standard deviations, of the difference
+        between what the keypoints suggest and what was given; 0 where it was estimated or is not known."""
+        found: dict[str, Tensor] = {}
+        for name, parameter in self.unknowns.items():
+            difference = (parameter.by_component("suggested") - parameter.by_component("given")).double()
+            squared = (difference / parameter.by_component("suggested_std").double()).square().sum(1)
+            found[name] = squared.nan_to_num(0.0, 0.0, 0.0) * (not parameter.refined)
+        return found
+
+    def explains_most(self, name: str) -> bool:
+        """Whether a cause explains more of the residuals than any other that is small enough to be told by linearising.
+
+        Args:
+            name: ``motion``, or a family of unknowns: ``lens`` or ``clock``.
+        """
+        strengths = {"motion": 0.0 if self.motion is None else self.motion.evidence, "lens": 0.0, "clock": 0.0}
+        for unknown, squared in self.contradictions.items():
+            family = all_unknowns()[unknown].family
+            strengths[family] = max(strengths.get(family, 0.0), float(squared.max()))
+        return self.consistent and strengths[name] >= max(strengths.values())
+
+    @cached_property
+    def acceptance(self) -> Acceptance | None:
+        """Errors in millimetres; None where nothing can be tested."""
+        return accepted(self.ended, self.noise, self.ruler)

@@ -1,0 +1,1 @@
+"""The families of findings, one file each. :mod:`torchstickcal.quality.registry` imports them all."""

@@ -1,0 +1,120 @@
+"""What the body of the athlete says: its height, and whether left and right are exchanged in space."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+
+import torch
+from torch import Tensor
+
+from torchstickcal.quality.evidence import Evidence
+from torchstickcal.quality.finding import Finding, Severity
+from torchstickcal.quality.registry import findings
+
+_SEGMENTS = {("knee", "ankle"): 0.246, ("hip", "knee"): 0.245, ("shoulder", "elbow"): 0.186, ("elbow", "wrist"): 0.146}
+"""Lengths of segments as shares of the standing height (Drillis and Contini 1966, in Winter's tables)."""
+_TALL_M, _SHORT_M = 2.10, 1.35
+_TALLEST_M, _SHORTEST_M = 2.4, 1.1
+"""Standing heights, by the segments, that are unusual, and those that no athlete has. Heights from a detector's joints are wrong
+by up to 8 %."""
+_LEAST_FRAMES = 15
+_MIRRORED_SHARE = 0.8
+
+
+@findings("body", "the athlete's height, and left and right exchanged in space")
+def body(evidence: Evidence) -> Iterator[Finding]:
+    """Findings about the body."""
+    names = evidence.observations.point_names
+    if names is None:
+        return
+    places = {name: index for index, name in enumerate(names)}
+    yield from _height(evidence, places)
+    yield from _mirrored(evidence, places)
+
+
+def height_m(points: Tensor, places: dict[str, int]) -> float | None:
+    """The athlete's standing height by the lengths of the limbs; None where no limb is known.
+
+    Args:
+        points: (3, F, P), metres, NaN where not known.
+        places: index of each named point.
+    """
+    found: list[float] = []
+    for (start, end), share in _SEGMENTS.items():
+        for side in ("left", "right"):
+            pair = [places.get(f"{side}_{joint}") for joint in (start, end)]
+            if None not in pair:
+                lengths = (points[..., pair[1]] - points[..., pair[0]]).norm(dim=0)
+                lengths = lengths[lengths.isfinite()]
+                if len(lengths) >= _LEAST_FRAMES:
+                    found.append(float(lengths.median()) / share)
+    return float(torch.tensor(found).median()) if found else None
+
+
+def _height(evidence: Evidence, places: dict[str, int]) -> Iterator[Finding]:
+    height = height_m(evidence.points, places)
+    if height is None or _SHORT_M <= height <= _TALL_M:
+        return
+    impossible = not _SHORTEST_M <= height <= _TALLEST_M
+    yield Finding(
+        "athlete_height",
+        Severity.SERIOUS if impossible else Severity.CAUTION,
+        f"By the lengths of the limbs the athlete is {height:.2f} m tall: if that is not so, the length of the stick, and with it "
+        "the scale, is wrong by the same share.",
+        "Check the length of the stick, its unit, and which points are its ends.",
+        figure=height,
+        limit=_TALL_M if height > _TALL_M else _SHORT_M,
+        unit="m",
+        is_cause=True,
+    )
+
+
+def _mirrored(evidence: Evidence, places: dict[str, int]) -> Iterator[Finding]:
+    """A scene that is its own mirror image: knees, elbows, nose and toes say where forward is."""
+    points = evidence.points
+
+    def at(name: str) -> Tensor | None:
+        return points[..., places[name]] if name in places else None
+
+    def middle(candidates: Sequence[str]) -> Tensor | None:
+        known = [place for name in candidates if (place := at(name)) is not None]
+        return torch.stack(known).mean(0) if known else None
+
+    shoulders = at("left_shoulder"), at("right_shoulder")
+    low = middle(["left_hip", "right_hip"])
+    low = low if low is not None else middle(["pelvis", "hip"])
+    if shoulders[0] is None or shoulders[1] is None or low is None:
+        return
+    right = shoulders[1] - shoulders[0]
+    up = (shoulders[0] + shoulders[1]) / 2 - low
+    forward = torch.zeros_like(up)
+    for side in ("left", "right"):
+        hip = at(f"{side}_hip")
+        hip = hip if hip is not None else low
+        knee, ankle = at(f"{side}_knee"), at(f"{side}_ankle")
+        if knee is not None and ankle is not None:
+            forward = forward + (knee - (hip + ankle) / 2).nan_to_num()
+        toe, heel = at(f"{side}_big_toe"), at(f"{side}_heel")
+        if toe is not None and heel is not None:
+            forward = forward + (toe - heel).nan_to_num()
+    nose, ears = at("nose"), middle(["left_ear", "right_ear"])
+    if nose is not None and ears is not None:
+        forward = forward + 2 * (nose - ears).nan_to_num()
+    handed = (right * torch.linalg.cross(forward, up, dim=0)).sum(0)
+    size = right.norm(dim=0) * forward.norm(dim=0) * up.norm(dim=0)
+    clear = handed.isfinite() & (handed.abs() > 0.2 * size) & (size > 0)
+    if int(clear.sum()) < _LEAST_FRAMES:
+        return
+    share = float((handed[clear] < 0).double().mean())
+    if share > _MIRRORED_SHARE:
+        yield Finding(
+            "scene_mirrored",
+            Severity.SERIOUS,
+            f"In {share:.0%} of the frames the athlete's right side is on the left: all videos are mirrored, and the rig is its "
+            "own mirror image, or the names of left and right are exchanged.",
+            "Mirror the keypoints of all cameras, x to width - 1 - x, or exchange the names.",
+            figure=share,
+            limit=_MIRRORED_SHARE,
+            unit="share",
+            is_cause=True,
+        )

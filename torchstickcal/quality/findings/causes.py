@@ -1,0 +1,159 @@
+"""Why a camera contradicts the others, by trial: each explanation is tried, and the one that explains most is said."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+
+import torch
+
+from torchstickcal.geometry import se3
+from torchstickcal.metrics import rotation_angle
+from torchstickcal.quality.evidence import Evidence
+from torchstickcal.quality.finding import Finding, Severity
+from torchstickcal.quality.registry import findings
+from torchstickcal.quality.trials import Rest, Sight, hypotheses, moved_within, shifted_share, sight_of, tried, without
+
+_SOUND_SHARE, _GAIN = 0.65, 0.15
+"""Share of keypoints that agree in a sound camera, and the least gain of an explanation over none."""
+_MOST_SUSPECTS = 4
+_SUSPECT_SHARE = 0.8
+_NOISE_RATIO = 0.6
+
+
+@findings("causes", "why a camera contradicts the others, by trial", tries=True)
+def causes(evidence: Evidence) -> Iterator[Finding]:
+    """The explanation of what is wrong, if there is one."""
+    if evidence.cameras == 2:
+        yield from _of_a_pair(evidence)
+        return
+    agreement = evidence.agreement * (1 - evidence.ended.labels.other_person[0].double().mean(1))
+    order = agreement.argsort().tolist()
+    suspects = [camera for camera in order if float(agreement[camera]) < _SUSPECT_SHARE] or order
+    best: tuple[float, int, Rest] | None = None
+    for camera in suspects[:_MOST_SUSPECTS]:
+        rest = without(evidence, camera)
+        if rest is not None and (best is None or _soundness(rest) > best[0]):
+            best = _soundness(rest), camera, rest
+    if best is None:
+        return
+    _, camera, rest = best
+    whole = float(agreement.mean())
+    better = rest.share > whole + 0.05 or rest.noise_mrad < _NOISE_RATIO * evidence.noise_mrad
+    if rest.share < _SOUND_SHARE or not better:
+        return
+    yield _explained(evidence, camera, rest)
+
+
+def _soundness(rest: Rest) -> float:
+    return rest.share - 0.02 * rest.noise_mrad
+
+
+def _explained(evidence: Evidence, camera: int, rest: Rest) -> Finding:
+    """What is wrong with the camera without which the others agree."""
+    sight, name = sight_of(evidence, camera), evidence.camera(camera)
+    plain = rest.placed(sight)
+    as_given = 0.0 if plain is None else plain[0].share
+
+    def cause(code: str, what: str, advice: str, share: float, frames: tuple[int, int] | None = None) -> Finding:
+        return Finding(
+            code,
+            Severity.SERIOUS,
+            f"{name}: {what} ({share:.0%} of them; {as_given:.0%} as given).",
+            advice,
+            cameras=(name,),
+            frames=frames,
+            figure=share,
+            limit=_SOUND_SHARE,
+            unit="share",
+            is_cause=True,
+        )
+
+    if plain is not None and as_given > _SOUND_SHARE:
+        return cause(
+            "camera_misplaced",
+            "its keypoints agree with the other cameras at another place than the one that was found",
+            "Calibrate the other cameras first, or give a session in which this camera shares more with them.",
+            as_given,
+        )
+    found = [(h, placed[0].share) for h in hypotheses() if (placed := rest.placed(h.changed(sight))) is not None]
+    if found:
+        hypothesis, share = max(found, key=lambda one: one[1])
+        if share > _SOUND_SHARE and share > as_given + _GAIN:
+            return cause(hypothesis.code, hypothesis.what, hypothesis.advice, share)
+    if (moved := moved_within(rest, sight)) is not None:
+        return _moved(evidence, camera, *moved)
+    later, share = shifted_share(rest, sight, evidence.ended.frames[0].rate_hz)
+    if later and share > _SOUND_SHARE and share > as_given + _GAIN:
+        word = "later" if later > 0 else "earlier"
+        return cause(
+            "clock_apart",
+            f"its frames show what the other cameras see {abs(later)} frames {word}: so moved, its keypoints agree",
+            "Estimate the time offsets (refine 'time_offset'), or cut its video to begin with the others.",
+            share,
+        )
+    return cause(
+        "camera_alien",
+        "its keypoints agree with the other cameras at no place, neither mirrored, turned, scaled nor moved in time: it shows "
+        "another person or another recording",
+        "Check which person the detector follows in this camera, and that the video belongs to this session. Leave it out else.",
+        max([as_given, *(share for _, share in found)]),
+    )
+
+
+def _moved(evidence: Evidence, camera: int, frame: int, before: object, after: object) -> Finding:
+    name = evidence.camera(camera)
+    poses = [(one.rotation, one.translation) for one in (before, after)]  # type: ignore[attr-defined]
+    angle = float(rotation_angle(poses[1][0] @ poses[0][0].mT).rad2deg())
+    shift = float((se3.camera_centres(*poses[1]) - se3.camera_centres(*poses[0])).norm())
+    return Finding(
+        "camera_moved",
+        Severity.SERIOUS,
+        f"{name} moved by {angle:.2g} degrees and {1000 * shift:.2g} mm between frames {frame - 1} and {frame} (± 2).",
+        "Calibrate the frames before and after it separately (Observations.with_camera_split).",
+        cameras=(name,),
+        frames=(frame, evidence.observations.num_frames - 1),
+        figure=angle,
+        unit="deg",
+        is_cause=True,
+    )
+
+
+def _of_a_pair(evidence: Evidence) -> Iterator[Finding]:
+    """With two cameras, each explanation needs a calibration of its own."""
+    observations = evidence.observations
+    noise = evidence.noise_mrad
+    for hypothesis in hypotheses():
+        for camera in range(2):
+            changed: Sight = hypothesis.changed(sight_of(evidence, camera))
+            keypoints, matrix = observations.keypoints.clone(), observations.cameras.matrix.clone()
+            keypoints[camera] = changed.keypoints.to(keypoints)
+            matrix[camera] = changed.camera.matrix[0]
+            ended = tried(replace(observations, keypoints=keypoints, intrinsics=matrix), evidence.config, ())
+            if ended is None or not ended.converged:
+                continue
+            share = float(ended.kept.visible.sum() / ended.measurements.visible.sum().clamp_min(1))
+            own = 1000 * float(ended.last.sigma_px[0].median() / ended.measurements.cameras.focal_px.mean())
+            if share > _SOUND_SHARE and own < _NOISE_RATIO * noise and share > float(evidence.agreement.mean()) - 0.02:
+                name = evidence.camera(camera)
+                yield Finding(
+                    hypothesis.code,
+                    Severity.SERIOUS,
+                    f"{name}, or the other camera: {hypothesis.what} ({share:.0%} of them).",
+                    hypothesis.advice,
+                    cameras=(name,),
+                    figure=share,
+                    limit=_SOUND_SHARE,
+                    unit="share",
+                    is_cause=True,
+                )
+                return
+    yield Finding(
+        "pair_contradicts",
+        Severity.SERIOUS,
+        "The two cameras contradict each other, and no explanation that was tried makes them agree: they may show different "
+        "persons or different recordings.",
+        "Check which person the detector follows in each camera, and that both videos belong to this session.",
+        cameras=tuple(map(evidence.camera, range(2))),
+        is_cause=True,
+    )

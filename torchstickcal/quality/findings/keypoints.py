@@ -1,0 +1,141 @@
+"""Keypoints: label errors, wrong ones, unused ones, noisy ones, and values that are no pixels."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+from torchstickcal.pipeline.relabel import exchanges
+from torchstickcal.quality.evidence import Evidence
+from torchstickcal.quality.finding import Finding, Severity
+from torchstickcal.quality.registry import findings
+
+_USELESS_FOCAL_SHARE = 0.03
+_REJECTED_SHARE = 0.4
+"""Sound sessions with 20 % of wrong keypoints lose up to 30 %."""
+_OTHER_PERSON_SHARE = 0.2
+_CORNER_SHARE = 0.02
+_WHOLE_PX_NOISE = 0.6
+"""Noise, in pixels, below which the rounding of whole pixels, which has a standard deviation of 0.29, matters."""
+_NOISY_MRAD = 10.0
+"""Good detectors have 1 to 4; mirrored or alien cameras raise the noise of all to 10 and more."""
+
+
+@findings("keypoints", "label errors, wrong, unused and noisy keypoints, and values that are no pixels")
+def keypoints(evidence: Evidence) -> Iterator[Finding]:
+    """Findings about keypoints."""
+    yield from _values(evidence)
+    yield from _labels(evidence)
+    yield from _used(evidence)
+    yield from _noise(evidence)
+
+
+def _values(evidence: Evidence) -> Iterator[Finding]:
+    """Keypoints at (0, 0), and whole numbers of pixels."""
+    observations = evidence.observations
+    visible = observations.visible
+    total = max(1, int(visible.sum()))
+    for sentence in observations.warnings:
+        share = int(((observations.keypoints == 0).all(-1) & visible).sum()) / total
+        severity = Severity.CAUTION if share > _CORNER_SHARE else Severity.NOTE
+        meaning, advice = sentence.rsplit(" Set them", 1)
+        yield Finding(
+            "keypoints_at_corner", severity, meaning, f"Set them{advice}", figure=share, limit=_CORNER_SHARE, unit="share"
+        )
+    given = observations.keypoints[visible]
+    noise = float(evidence.sigma_px.median())
+    if len(given) and noise < _WHOLE_PX_NOISE and bool((given == given.round()).all()):
+        yield Finding(
+            "whole_pixels",
+            Severity.NOTE,
+            f"All keypoints are whole numbers of pixels, but their noise is only {noise:.2g} px, so that rounding is a part of it.",
+            "Write the keypoints with decimals.",
+            figure=noise,
+            limit=_WHOLE_PX_NOISE,
+            unit="px",
+        )
+
+
+def _labels(evidence: Evidence) -> Iterator[Finding]:
+    """Label errors that were undone, and frames that show another person."""
+    observations, labels = evidence.observations, evidence.ended.labels
+    frames = observations.num_frames
+    for exchange in exchanges(observations.point_names, [stick.ends for stick in observations.sticks]):
+        for camera, count in enumerate(labels.exchanged_frames(exchange)[0].sum(-1).tolist() if exchange.whole else ()):
+            if count:
+                yield Finding(
+                    "labels_exchanged",
+                    Severity.NOTE,
+                    f"{evidence.camera(camera)}: {exchange.what} were exchanged in {count} of {frames} frames, and corrected.",
+                    cameras=(evidence.camera(camera),),
+                    figure=count,
+                    limit=0,
+                    unit="frames",
+                )
+    for camera, count in enumerate(labels.other_person[0].sum(-1).tolist()):
+        if count:
+            yield Finding(
+                "other_person",
+                Severity.SERIOUS if count > _OTHER_PERSON_SHARE * frames else Severity.NOTE,
+                f"{evidence.camera(camera)}: {count} of {frames} frames were not used: all their keypoints contradict the other "
+                "cameras, as if they showed another person.",
+                "Check which person the detector follows in this camera." if count > _OTHER_PERSON_SHARE * frames else "",
+                cameras=(evidence.camera(camera),),
+                figure=count / frames,
+                limit=_OTHER_PERSON_SHARE,
+                unit="share",
+            )
+
+
+def _used(evidence: Evidence) -> Iterator[Finding]:
+    """Keypoints that took no part."""
+    observations, measurements, ended = evidence.observations, evidence.measurements, evidence.ended
+    comparable, kept = int(measurements.visible.sum()), int(ended.last.inliers.sum())
+    takes_part = measurements.by_frame(measurements.active[0]).any(0)
+    same_person = ~ended.frames[0].to_own(ended.labels.other_person[0], False)
+    seen = int((observations.visible[:, :, takes_part] & same_person[..., None]).sum())
+    if seen > comparable:
+        yield Finding(
+            "keypoints_unused",
+            Severity.NOTE,
+            f"{seen - comparable} of {seen} keypoints were not used: no second camera saw the point in that frame.",
+            figure=(seen - comparable) / seen,
+            unit="share",
+        )
+    if comparable > kept:
+        share = (comparable - kept) / comparable
+        yield Finding(
+            "keypoints_rejected",
+            Severity.CAUTION if share > _REJECTED_SHARE else Severity.NOTE,
+            f"{comparable - kept} of {comparable} keypoints ({share:.1%}) were rejected: they contradict the others.",
+            figure=share,
+            limit=_REJECTED_SHARE,
+            unit="share",
+        )
+
+
+def _noise(evidence: Evidence) -> Iterator[Finding]:
+    """Points, or all keypoints, with too much noise."""
+    focal = evidence.measurements.cameras.focal_px.mean()
+    noisy = (evidence.sigma_px > _USELESS_FOCAL_SHARE * focal).nonzero().flatten().tolist()
+    if noisy:
+        names = tuple(map(evidence.point, noisy))
+        yield Finding(
+            "points_noisy",
+            Severity.CAUTION,
+            f"The keypoints of these points are too noisy, and the points not reliable: {', '.join(names)}.",
+            points=names,
+            figure=float(evidence.sigma_px.max()),
+            limit=float(_USELESS_FOCAL_SHARE * focal),
+            unit="px",
+        )
+    if evidence.noise_mrad > _NOISY_MRAD:
+        yield Finding(
+            "noise_large",
+            Severity.SERIOUS,
+            f"The keypoints contradict each other by {float(evidence.sigma_px.median()):.3g} px ({evidence.noise_mrad:.2g} mrad) "
+            "on average, several times more than those of a good detector.",
+            "Look at the videos with the keypoints drawn into them, and check the intrinsics.",
+            figure=evidence.noise_mrad,
+            limit=_NOISY_MRAD,
+            unit="mrad",
+        )

@@ -1,0 +1,144 @@
+"""Lenses and clocks: given values that the keypoints contradict, and what was to be estimated and could not be."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+from torchstickcal.model.unknowns import CameraUnknown, all_unknowns
+from torchstickcal.quality.evidence import Evidence
+from torchstickcal.quality.finding import Finding, Severity
+from torchstickcal.quality.registry import findings
+from torchstickcal.result import CameraParameter
+
+_CONTRADICTED_SIGMAS = 4.0
+_CLEAR_SIGMAS = 8.0
+"""For values with a weak prior, which biased keypoints move easily."""
+_OPEN_SHARE = 0.5
+_WRONG_FOCAL = 0.01
+"""Error of a focal length from which on the camera's distance is wrong by more than 1 %."""
+_WRONG_FRAMES = 0.5
+"""Time offset, in frames, from which on the clocks matter."""
+
+
+@findings("unknowns", "lenses and clocks that the keypoints contradict or do not determine")
+def unknowns(evidence: Evidence) -> Iterator[Finding]:
+    """Findings about lenses and clocks."""
+    for name, unknown in all_unknowns().items():
+        yield from _contradicted(evidence, unknown, evidence.unknowns[name])
+        yield from _different(evidence, unknown, evidence.unknowns[name])
+        yield from _undetermined(evidence, unknown, evidence.unknowns[name])
+    if evidence.unsynchronised and not _in_step(evidence):
+        yield Finding(
+            "unsynchronised",
+            Severity.SERIOUS,
+            "The cameras do not seem to be synchronised: other frames fit together better than those of equal number or time.",
+            "Estimate the time offsets (refine 'time_offset').",
+            is_cause=evidence.explains_most("clock"),
+        )
+    for camera, reason in enumerate(evidence.clocks.reasons if evidence.clocks is not None else ()):
+        if reason:
+            name = evidence.camera(camera)
+            yield Finding(
+                "time_offset_uncertain", Severity.CAUTION, f"{name}: its time offset is uncertain, {reason}.", cameras=(name,)
+            )
+
+
+def _in_step(evidence: Evidence) -> bool:
+    """Whether the points say that the cameras are synchronised, to a fraction of a frame."""
+    rate, offset = evidence.ended.frames[0].rate_hz, evidence.unknowns["time_offset"]
+    if rate is None or not evidence.consistent:
+        return False
+    known = offset.suggested_std * rate < _WRONG_FRAMES / 2
+    return bool((known & ((offset.suggested - offset.given).abs() * rate < _WRONG_FRAMES)).all())
+
+
+def _contradicted(evidence: Evidence, unknown: CameraUnknown, parameter: CameraParameter) -> Iterator[Finding]:
+    """Given values that the keypoints contradict."""
+    guessed = unknown.family == "lens" and not evidence.observations.intrinsics_known
+    if unknown.noticeable_prior_share is None or guessed or (parameter.refined and unknown.family == "clock"):
+        return
+    names = ("value", "std") if parameter.refined else ("suggested", "suggested_std")
+    first = (parameter.by_component(name)[:, 0].tolist() for name in (*names, "given", "prior_std"))
+    for camera, (value, std, given, prior_std) in enumerate(zip(*first, strict=True)):
+        if not abs(value - given) > max(_CONTRADICTED_SIGMAS * std, unknown.noticeable_prior_share * prior_std):
+            continue
+        name = evidence.camera(camera)
+        what = f"{name}: {unknown.label} {_quantity(value, std, unknown.unit)}"
+        if parameter.refined:
+            meaning, advice = f"{what} estimated, {_quantity(given, None, unknown.unit)} was given.", ""
+        else:
+            meaning = f"{what} suggested by the keypoints, but {_quantity(given, None, unknown.unit)} was given and used."
+            advice = f"Check it, or estimate it (refine {next(iter(unknown.variants))!r})."
+        matters = not parameter.refined and _matters(evidence, unknown.name, value - given, given)
+        yield Finding(
+            f"{unknown.name}_contradicted",
+            Severity.NOTE if parameter.refined else Severity.SERIOUS if matters else Severity.CAUTION,
+            meaning,
+            advice,
+            cameras=(name,),
+            figure=(value - given) / std if std > 0 else None,
+            limit=_CONTRADICTED_SIGMAS,
+            unit="standard deviations",
+            is_cause=matters and evidence.explains_most(unknown.family),
+        )
+
+
+def _different(evidence: Evidence, unknown: CameraUnknown, parameter: CameraParameter) -> Iterator[Finding]:
+    """Given values that small errors of the keypoints change much, where the keypoints clearly want others."""
+    guessed = unknown.family == "lens" and not evidence.observations.intrinsics_known
+    if unknown.noticeable_prior_share is not None or unknown.family != "lens" or parameter.refined or guessed:
+        return
+    difference = (parameter.by_component("suggested") - parameter.by_component("given")).abs()
+    far = (difference > parameter.by_component("prior_std")).any(1)
+    for camera in (far & (evidence.contradictions[unknown.name] > _CLEAR_SIGMAS**2)).nonzero().flatten().tolist():
+        name = evidence.camera(camera)
+        pairs = zip(parameter.by_component("suggested")[camera].tolist(), parameter.by_component("given")[camera].tolist(), strict=True)
+        values = ", ".join(
+            f"{component} {_quantity(value, None, unknown.unit)} instead of {_quantity(given, None, unknown.unit)}"
+            for component, (value, given) in zip(unknown.components, pairs, strict=True)
+        )
+        yield Finding(
+            f"{unknown.name}_contradicted",
+            Severity.CAUTION,
+            f"{name}: the keypoints suggest another {unknown.label}: {values}.",
+            f"Check it, or estimate it (refine {next(iter(unknown.variants))!r}).",
+            cameras=(name,),
+            figure=float(evidence.contradictions[unknown.name][camera].sqrt()),
+            limit=_CLEAR_SIGMAS,
+            unit="standard deviations",
+            is_cause=evidence.explains_most("lens"),
+        )
+
+
+def _matters(evidence: Evidence, name: str, difference: float, given: float) -> bool:
+    """Whether a wrong value makes the cameras wrong by about 1 %."""
+    if name == "focal":
+        return abs(difference) > _WRONG_FOCAL * abs(given)
+    rate = evidence.ended.frames[0].rate_hz
+    return name == "time_offset" and rate is not None and abs(difference) * rate > _WRONG_FRAMES
+
+
+def _undetermined(evidence: Evidence, unknown: CameraUnknown, parameter: CameraParameter) -> Iterator[Finding]:
+    """What was to be estimated and could not be."""
+    if not parameter.refined:
+        return
+    uncertain = parameter.by_component("std") > _OPEN_SHARE * parameter.by_component("prior_std")
+    for number, component in enumerate(unknown.components):
+        cameras = uncertain[:, number].nonzero().flatten().tolist()
+        if cameras:
+            names = tuple(map(evidence.camera, cameras))
+            yield Finding(
+                f"{unknown.name}_undetermined",
+                Severity.CAUTION,
+                f"{component} stays near the given value: the keypoints do not determine it ({', '.join(names)}).",
+                cameras=names,
+                limit=_OPEN_SHARE,
+                unit="prior standard deviations",
+            )
+
+
+def _quantity(value: float, std: float | None, unit: str) -> str:
+    """A value with its standard deviation and unit."""
+    factor, unit = (1000, "ms") if unit == "s" else (1, unit)
+    number = f"{factor * value:.5g}" if std is None else f"{factor * value:.5g} ± {factor * std:.2g}"
+    return f"{number} {unit}".strip()

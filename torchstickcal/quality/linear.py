@@ -1,0 +1,107 @@
+"""The keypoints of one session, linearised at a solution and reduced to the cameras, frame by frame.
+
+The points are eliminated exactly, and neither sticks nor smoothness take part. What is left of a frame is how strongly, and in
+which direction, its keypoints pull at the pose of each camera, when every point may follow.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from torchstickcal.geometry.symmetric import IDENTITY, cholesky, forward
+from torchstickcal.losses import ReprojectionLoss
+from torchstickcal.losses.robust import GemanMcClure
+from torchstickcal.model.measurements import Measurements
+from torchstickcal.model.objective import Objective
+from torchstickcal.model.state import State
+from torchstickcal.solvers.elimination.cross_blocks import cross_rows
+
+_MOST_PARTS = 400
+"""Parts of a session of which the information is kept apart. Longer sessions have several frames in a part."""
+_KERNEL_SIGMAS = 6.0
+"""Scale of the robust kernel: wrong keypoints must not look like a motion, and those of a camera that moved should pull."""
+
+
+@dataclass(frozen=True)
+class FramePulls:
+    """How the keypoints of each frame pull at the cameras.
+
+    Poses are perturbed on the world's side, ``T <- T Exp(tangent)``: tangents are (translation, rotation), metres and radians.
+    """
+
+    gradient: Tensor
+    """(F, C, 6), half the gradient of the squared whitened residuals by the tangents"""
+    information: Tensor
+    """(K, 6 C, 6 C), information about the tangents in each part of the session"""
+    part: Tensor
+    """(F,), the part that each frame is in"""
+
+    @staticmethod
+    def of(measurements: Measurements, state: State, sigma_px: Tensor) -> FramePulls:
+        """Of one session.
+
+        Args:
+            measurements: all keypoints, inliers and outliers.
+            state: the solution.
+            sigma_px: noise of each point's keypoints, (1, P), pixels.
+        """
+        m, cameras = measurements, measurements.num_cameras
+        loss = ReprojectionLoss(sigma_px[:, None, None], kernel=GemanMcClure(_KERNEL_SIGMAS))
+        objective = Objective(m, {"reprojection": loss})
+        count = min(m.frames, _MOST_PARTS)
+        part = torch.arange(m.frames, device=state.points.device) * count // m.frames
+        gradient = state.points.new_zeros(m.frames, cameras, 6)
+        information = state.points.new_zeros(count, 6 * cameras, 6 * cameras)
+        for columns, frames in zip(m.chunks(), m.frame_slices(), strict=True):
+            terms = objective.linearise_chunk(state, columns, by_unknowns=False)["reprojection"]
+            points, seen = state.points[0][:, columns], m.active[0, columns]
+            pulls, blocks = _reduced(terms.gradient[0].double(), terms.hessian[0].double(), points, seen, m.points_per_frame)
+            gradient[frames] = pulls
+            information.index_add_(0, part[frames], blocks)
+        return FramePulls(gradient, information, part)
+
+    @property
+    def parts(self) -> int:
+        """K"""
+        return len(self.information)
+
+    @property
+    def gradient_by_part(self) -> Tensor:
+        """(K, C, 6)"""
+        return self.gradient.new_zeros(self.parts, *self.gradient.shape[1:]).index_add_(0, self.part, self.gradient)
+
+    def first_frame(self, part: int) -> int:
+        """The first frame of a part."""
+        return int((self.part == part).nonzero()[0])
+
+
+def _reduced(gradients: Tensor, blocks: Tensor, points: Tensor, seen: Tensor, per_frame: int) -> tuple[Tensor, Tensor]:
+    """Pulls (f, C, 6) and information (f, 6 C, 6 C) of the frames of a chunk.
+
+    Args:
+        gradients: (C, 3, n), by the points.
+        blocks: (C, 6, n), Hessians by the points.
+        points: (3, n).
+        seen: (n,), whether two cameras or more see a point.
+        per_frame: P.
+    """
+    cameras, columns = len(blocks), blocks.shape[-1]
+    frames = columns // per_frame
+    total = blocks.sum(0).where(seen, blocks.new_tensor(IDENTITY)[:, None])
+    lower = cholesky(total)
+    rows = cross_rows(blocks[None], points[None])[0]
+    turned = torch.linalg.cross(points.expand(cameras, 6, 3, columns), rows, dim=2)
+    own = torch.cat([rows, turned], dim=2).unflatten(-1, (frames, per_frame)).sum(-1)
+    half = forward(lower, rows)
+    solved = forward(lower, gradients.sum(0))
+    direct = torch.cat([gradients, torch.linalg.cross(points.expand_as(gradients), gradients, dim=1)], dim=1)
+    pulls = (direct - (half * solved).sum(2)).unflatten(-1, (frames, per_frame)).sum(-1).movedim(-1, 0)
+    by_frame = half.flatten(0, 1).unflatten(-1, (frames, per_frame)).permute(2, 0, 1, 3).flatten(2)
+    information = -by_frame @ by_frame.mT
+    for camera in range(cameras):
+        place = slice(6 * camera, 6 * camera + 6)
+        information[:, place, place] += own[camera].permute(2, 0, 1)
+    return pulls, information

@@ -1,0 +1,227 @@
+"""Causes, found by trial: the rig without a camera, and this camera again as it would be under each explanation."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from torchstickcal.errors import CalibrationError
+from torchstickcal.geometry.cameras import Intrinsics
+from torchstickcal.observations import Observations
+from torchstickcal.pipeline.adjust import Adjustment, adjust_cameras, begin
+from torchstickcal.pipeline.run import Run
+from torchstickcal.quality.evidence import Evidence
+from torchstickcal.quality.resection import Resection, resected
+
+_SCALES = (1 / 3, 0.5, 2 / 3, 0.75, 4 / 3, 1.5, 2.0, 3.0)
+"""Ratios of resolutions that videos are commonly converted by."""
+_LARGEST_SHIFT_S = 1.0
+_COARSE_SHIFTS = 12
+
+
+class Sight(NamedTuple):
+    """Keypoints and intrinsics of one camera."""
+
+    keypoints: Tensor
+    """(F, P, 2), pixels"""
+    camera: Intrinsics
+    """of one camera"""
+    size: Tensor | None
+    """(2,), of its images"""
+
+
+@dataclass(frozen=True)
+class Hypothesis:
+    """What may be wrong with one camera.
+
+    Args:
+        code: of the finding.
+        what: what it means, after the name of the camera.
+        advice: one sentence.
+        changed: gives the camera as it would be if this were so.
+    """
+
+    code: str
+    what: str
+    advice: str
+    changed: Callable[[Sight], Sight]
+
+
+def hypotheses() -> Iterator[Hypothesis]:
+    """What may be wrong with one camera, the simplest first."""
+    yield Hypothesis(
+        "camera_mirrored",
+        "its video is mirrored: with left and right exchanged its keypoints agree",
+        "Mirror its keypoints, x to width - 1 - x, or record it again without mirroring.",
+        _mirrored,
+    )
+    yield Hypothesis(
+        "intrinsics_turned",
+        "its intrinsics are those of a video turned by 90 degrees: with the coordinates of the centre exchanged its keypoints agree",
+        "Give the intrinsics of the video as the detector saw it.",
+        _turned,
+    )
+    for scale in _SCALES:
+        yield Hypothesis(
+            "intrinsics_other_resolution",
+            f"its intrinsics are those of another resolution: with all of them times {scale:.3g} its keypoints agree",
+            "Give the intrinsics of the resolution that the detector saw.",
+            _scaled(scale),
+        )
+
+
+def _mirrored(sight: Sight) -> Sight:
+    width = 2 * sight.camera.matrix[0, 0, 2] + 1 if sight.size is None else sight.size[0]
+    keypoints = sight.keypoints.clone()
+    keypoints[..., 0] = width - 1 - keypoints[..., 0]
+    return sight._replace(keypoints=keypoints)
+
+
+def _turned(sight: Sight) -> Sight:
+    matrix = sight.camera.matrix.clone()
+    matrix[:, 0, 2], matrix[:, 1, 2] = sight.camera.matrix[:, 1, 2], sight.camera.matrix[:, 0, 2]
+    matrix[:, 0, 0], matrix[:, 1, 1] = sight.camera.matrix[:, 1, 1], sight.camera.matrix[:, 0, 0]
+    return sight._replace(camera=replace(sight.camera, matrix=matrix))
+
+
+def _scaled(scale: float) -> Callable[[Sight], Sight]:
+    def changed(sight: Sight) -> Sight:
+        factor = torch.ones_like(sight.camera.matrix)
+        factor[:, :2] = scale
+        return sight._replace(camera=replace(sight.camera, matrix=sight.camera.matrix * factor))
+
+    return changed
+
+
+@dataclass(frozen=True)
+class Rest:
+    """The rig without one camera, calibrated by itself.
+
+    Args:
+        adjustment: of the other cameras.
+        points: (3, F, P), metres; NaN where fewer than two of the others see a point.
+        sigma_px: (P,), noise of each point's keypoints.
+    """
+
+    adjustment: Adjustment
+    points: Tensor
+    sigma_px: Tensor
+
+    @property
+    def share(self) -> float:
+        """Share of the other cameras' keypoints that agree with each other."""
+        kept, seen = self.adjustment.kept.visible.sum(), self.adjustment.measurements.visible.sum()
+        return float(kept / seen.clamp_min(1))
+
+    @property
+    def noise_mrad(self) -> float:
+        """Median noise of their keypoints, as an angle."""
+        return 1000 * float(self.sigma_px.median() / self.adjustment.measurements.cameras.focal_px.mean())
+
+    def placed(self, sight: Sight, frames: slice = slice(None), later: int = 0) -> tuple[Resection, Tensor] | None:
+        """A camera placed by the points of the others, and which keypoints (F, P) that is about; None where no place fits.
+
+        Args:
+            sight: the camera.
+            frames: that count.
+            later: frames by which the camera's frames belong to later ones of the others.
+        """
+        points = self.points.roll(-later, 1)
+        usable = points.isfinite().all(0) & sight.keypoints.isfinite().all(-1)
+        chosen = torch.zeros_like(usable)
+        chosen[frames] = usable[frames]
+        if later:
+            chosen[-later if later > 0 else 0 : None if later > 0 else -later] = False
+        sigma = self.sigma_px.expand(usable.shape)[chosen]
+        placed = resected(points[:, chosen], sight.keypoints[chosen].mT, sigma, sight.camera)
+        return None if placed is None else (placed, chosen)
+
+
+def without(evidence: Evidence, camera: int) -> Rest | None:
+    """The rig without a camera; None where the others are no rig by themselves."""
+    others = [other for other in range(evidence.cameras) if other != camera]
+    if len(others) < 2:
+        return None
+    groups = evidence.config.camera_groups
+    config = replace(evidence.config, camera_groups=[groups[other] for other in others] if groups else [])
+    observations = evidence.ended.labels.applied(evidence.observations) if _synchronous(evidence) else evidence.observations
+    ended = tried(observations.of_cameras(others), config, evidence.ended.refined)
+    if ended is None:
+        return None
+    known = ended.kept.active[0]
+    points = ended.measurements.by_frame(ended.state.points[0].where(known, torch.nan))
+    return Rest(ended, points, ended.last.sigma_px[0])
+
+
+def tried(observations: Observations, config: object, refined: tuple[str, ...]) -> Adjustment | None:
+    """A session adjusted without anybody listening; None where its cameras are no rig."""
+    run = Run(config)  # type: ignore[arg-type]
+    try:
+        return adjust_cameras(begin(observations, run, refined), run)
+    except CalibrationError:
+        return None
+
+
+def sight_of(evidence: Evidence, camera: int) -> Sight:
+    """One camera as it was given."""
+    observations = evidence.observations
+    keypoints = observations.keypoints[camera].double()
+    size = observations.image_size
+    return Sight(
+        keypoints.where(observations.visible[camera][..., None], torch.nan),
+        observations.cameras[camera : camera + 1],
+        None if size is None else (size if size.ndim == 1 else size[camera]),
+    )
+
+
+def _synchronous(evidence: Evidence) -> bool:
+    frames = evidence.ended.frames[0]
+    return not frames.apart and evidence.measurements.frames == evidence.observations.num_frames
+
+
+def shifted_share(rest: Rest, sight: Sight, rate_hz: float | None) -> tuple[int, float]:
+    """The number of frames by which a camera's frames belong to later ones of the others, and the share that then agrees."""
+    frames = rest.points.shape[1]
+    most = min(frames // 2, math.ceil(_LARGEST_SHIFT_S * rate_hz) if rate_hz else frames // 2)
+    step = max(1, most // _COARSE_SHIFTS)
+    best, share = 0, 0.0
+    for width in (step, 1) if step > 1 else (1,):
+        around = range(-most, most + 1, step) if width == step else range(best - step, best + step + 1)
+        for later in around:
+            placed = rest.placed(sight, later=later)
+            if placed is not None and placed[0].share > share:
+                best, share = later, placed[0].share
+    return best, share
+
+
+def moved_within(rest: Rest, sight: Sight) -> tuple[int, Resection, Resection] | None:
+    """A camera that moved far: the first frame after it, and its places before and after; None where it did not."""
+    frames = rest.points.shape[1]
+    third = max(1, frames // 3)
+    start, end = rest.placed(sight, slice(0, third)), rest.placed(sight, slice(frames - third, frames))
+    if start is None or end is None:
+        return None
+    usable = rest.points.isfinite().all(0) & sight.keypoints.isfinite().all(-1)
+    agree = [_agreeing(placed[0], rest, sight, usable).sum(-1).double() for placed in (start, end)]
+    gain = torch.nn.functional.pad((agree[0] - agree[1]).cumsum(0), (1, 0))
+    frame = int(gain.argmax())
+    total = usable.sum()
+    share = float((agree[0][:frame].sum() + agree[1][frame:].sum()) / total.clamp_min(1))
+    single = max(float(one.sum() / total.clamp_min(1)) for one in agree)
+    if not third // 2 < frame < frames - third // 2 or share < 0.65 or share < single + 0.1:
+        return None
+    before, after = rest.placed(sight, slice(0, frame)), rest.placed(sight, slice(frame, frames))
+    return None if before is None or after is None else (frame, before[0], after[0])
+
+
+def _agreeing(placed: Resection, rest: Rest, sight: Sight, usable: Tensor) -> Tensor:
+    """(F, P), the keypoints that agree with a camera at some place."""
+    in_camera = torch.einsum("ij,jfp->fpi", placed.rotation, rest.points) + placed.translation
+    pixels = sight.camera.project(in_camera.nan_to_num().flatten(0, 1)[None])[0].view(*usable.shape, 2)
+    near = (pixels - sight.keypoints).norm(dim=-1) < 6.0 * rest.sigma_px
+    return near & usable & (in_camera[..., 2] > 0)
