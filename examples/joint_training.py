@@ -82,9 +82,9 @@ def main() -> None:
     training = Training(plan, options.logdir)
     training.measure("before training", 0)
     training.learn_labels()
-    before = training.measure("trained on labels", 0)
+    before = training.measure("trained on labels", plan.first_steps)
     training.learn_jointly()
-    after = training.measure("trained jointly", plan.joint_steps)
+    after = training.measure("trained jointly", plan.first_steps + plan.joint_steps)
     if training.first:
         print(f"\n{'test sessions':24} {'before':>8} {'after':>8}")
         for name, value in before.items():
@@ -141,7 +141,7 @@ class Training:
             self._descend(optimiser, loss)
             self._log_loss("joint", step, loss, every=5)
             if step and step % 30 == 0:
-                self.measure(f"step {step}", step)
+                self.measure(f"step {step}", self._plan.first_steps + step)
 
     def measure(self, name: str, step: int) -> dict[str, float]:
         """The errors on the test sessions, printed and logged."""

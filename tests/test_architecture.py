@@ -28,7 +28,7 @@ FLOORS = [
     ["solvers"],
     ["quality.finding"],
     ["quality.verdict"],
-    ["result", "metrics"],
+    ["result", "metrics", "bridges"],
     ["pipeline.run", "pipeline.scale"],
     ["pipeline.stage"],
     ["pipeline.initialise", "pipeline.synchronise"],

@@ -49,7 +49,7 @@ _HOMES = {
     "config_names": "config",
     "load_config": "config",
 }
-_SUBPACKAGES = {"io", "losses", "metrics", "simulate"}
+_SUBPACKAGES = {"bridges", "io", "losses", "metrics", "simulate"}
 
 __all__ = [
     "Calibration",

@@ -312,7 +312,7 @@ class Calibration:
             "fps": self.fps,
             "point_names": self.point_names,
             "camera_names": self.camera_names,
-            "stages": [dataclasses.asdict(stage) | {"stop": stage.stop.name} for stage in self.stages],
+            "stages": [_stage_as_plain(stage) for stage in self.stages],
             "seconds": self.seconds,
             "quality": self.quality.as_json(),
             "left_out": self.left_out,
@@ -382,6 +382,13 @@ def _parameter(arrays: Mapping[str, Any], name: str, about: dict[str, Any], came
         _checked(about["refined"], bool),
         **tensors,
     )
+
+
+def _stage_as_plain(stage: StageRecord) -> dict[str, Any]:
+    """What is saved of a stage: all but the poses at each iteration."""
+    poses = {"rotations", "translations"}
+    iterations = [{name: value for name, value in vars(record).items() if name not in poses} for record in stage.iterations]
+    return {**vars(stage), "stop": stage.stop.name, "iterations": iterations}
 
 
 def _stage_record(stage: dict[str, Any]) -> StageRecord:

@@ -145,6 +145,10 @@ class Progress:
         self._following = following
         self._live = sys.stderr.isatty()
 
+    def on_start(self, observations: Observations) -> None:
+        if (on_start := getattr(self._following, "on_start", None)) is not None:
+            on_start(observations)
+
     def on_iteration(self, record: IterationRecord) -> None:
         if self._live:
             line = f"{record.stage}: iteration {record.iteration}, cost {record.cost:.6g}"

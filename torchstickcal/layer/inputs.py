@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -10,13 +10,16 @@ import torch
 from torch import Tensor
 
 from torchstickcal.arrays import names_of, tensor_of, truth_of
-from torchstickcal.errors import ObservationError
+from torchstickcal.errors import CalibrationError, ObservationError, RigError
 from torchstickcal.geometry.cameras import Intrinsics
 from torchstickcal.model.measurements import Measurements
 from torchstickcal.model.unknowns import RigUnknowns
 from torchstickcal.observations import Observations, coefficients_of
 from torchstickcal.pipeline.relabel import Labels
 from torchstickcal.stick import Stick, check_ends
+
+_OF_THE_KEYPOINTS = ("keypoints", "sticks")
+"""Where the errors of observations say that the fault is, if it is in what the detector saw."""
 
 
 @dataclass(frozen=True)
@@ -82,9 +85,33 @@ class LayerInputs:
 
     def no_gradient(self) -> Tensor:
         """Zero, through which a gradient of zero flows back to everything that was given."""
-        lens = self.cameras.distortion
-        given = (self.keypoints, self.confidence, self.cameras.matrix, lens, self.lengths_m)
-        return sum((tensor[..., :0].sum().double() for tensor in given if tensor is not None), self.lengths_m.new_zeros(()))
+        return sum((tensor[..., :0].sum().double() for tensor in self.tensors().values()), self.lengths_m.new_zeros(()))
+
+    def tensors(self) -> dict[str, Tensor]:
+        """Everything through which gradients flow, by name."""
+        named = {
+            "keypoints": self.keypoints,
+            "confidence": self.confidence,
+            "matrix": self.cameras.matrix,
+            "distortion": self.cameras.distortion,
+            "lengths_m": self.lengths_m,
+        }
+        return {name: tensor for name, tensor in named.items() if tensor is not None}
+
+    def with_tensors(self, tensors: Mapping[str, Tensor]) -> LayerInputs:
+        """The same arguments with other :meth:`tensors`, of as many sessions or more."""
+        sessions, image_size = len(tensors["keypoints"]), self.image_size
+        if image_size is not None and len(image_size) != sessions:  # under a transform that adds sessions
+            image_size = image_size.repeat(sessions // len(image_size), 1, 1)
+        return LayerInputs(
+            tensors["keypoints"],
+            tensors.get("confidence"),
+            Intrinsics(tensors["matrix"], tensors.get("distortion"), self.cameras.fisheye),
+            tensors["lengths_m"],
+            image_size,
+            self.sticks,
+            self.point_names,
+        )
 
     def of_sessions(self, chosen: list[int]) -> LayerInputs:
         """Some of the sessions."""
@@ -110,7 +137,7 @@ class LayerInputs:
         """One session, without gradients.
 
         Raises:
-            ObservationError: if it cannot be used.
+            ObservationError: if it cannot be used; :func:`is_of_session` says whether its keypoints are the reason.
         """
         distortion = self.cameras.distortion
         lengths = self.lengths_m[session].tolist()
@@ -168,6 +195,11 @@ class LayerInputs:
             stick_sigma_m=torch.tensor([stick.sigma_m for stick in self.sticks], dtype=torch.float64),
             unknowns=RigUnknowns.of(refined, self.cameras, groups),
         )
+
+
+def is_of_session(error: CalibrationError) -> bool:
+    """Whether an error is about the keypoints of one session. Otherwise an argument is wrong."""
+    return isinstance(error, RigError) or error.where.startswith(_OF_THE_KEYPOINTS)
 
 
 def _confidence(value: Any, keypoints: Tensor) -> Tensor:

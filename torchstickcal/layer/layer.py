@@ -5,16 +5,17 @@ from __future__ import annotations
 import itertools
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import torch
 from torch import nn
 
 from torchstickcal.arrays import names_of, tensor_of
 from torchstickcal.config import Config, load_config
-from torchstickcal.errors import ConfigError, ObservationError, RigError
-from torchstickcal.layer.inputs import LayerInputs
+from torchstickcal.errors import CalibrationError, ConfigError, ObservationError, RigError, quoted
+from torchstickcal.layer.inputs import LayerInputs, is_of_session
 from torchstickcal.layer.result import LayerResult
+from torchstickcal.layer.transforms import calibrated_in_any_transform, is_transformed, outside_graphs
 from torchstickcal.model.state import State
 from torchstickcal.model.unknowns import RigUnknowns
 from torchstickcal.pipeline.adjust import Adjustment, adjust_cameras, adjust_points, begin
@@ -45,9 +46,12 @@ class CalibrationLayer(nn.Module):
         config: as of :func:`torchstickcal.calibrate`; its solver does not matter to the gradients.
         gradient: ``implicit`` (exact), ``gauss_newton`` (approximate), ``unrolled``, or a :class:`GradientMode`.
         point_names: names of the points, for sticks and losses that name them.
+        on_failure: what happens if a session cannot be calibrated: ``status`` (its status says why, and its gradients are zero)
+            or ``raise`` (an error for the whole batch).
 
     Raises:
-        ConfigError: if the configuration cannot be used, or leaves it to the data what is refined.
+        ConfigError: if the configuration cannot be used, or leaves it to the data what is refined, or for another
+            ``on_failure``.
         ObservationError: if ``sticks`` are no sticks, or one names a point that is not among ``point_names``.
 
     Example:
@@ -66,6 +70,7 @@ class CalibrationLayer(nn.Module):
         config: str | Path | Mapping[str, Any] | Config = "default",
         gradient: str | GradientMode = "implicit",
         point_names: Sequence[str] | None = None,
+        on_failure: Literal["status", "raise"] = "status",
     ) -> None:
         super().__init__()
         self.point_names = names_of(point_names, "point_names")
@@ -73,6 +78,18 @@ class CalibrationLayer(nn.Module):
         self.config = load_config(config)
         self._refined = _refined(self.config)
         self.gradient = gradient_mode(gradient)
+        if on_failure not in ("status", "raise"):
+            raise ConfigError(
+                "no such way to treat failures", where="on_failure", got=quoted(on_failure), expected="'status' or 'raise'"
+            )
+        self.on_failure = on_failure
+
+    def extra_repr(self) -> str:
+        """What ``print(layer)`` shows."""
+        gradient = type(self.gradient).__name__
+        return (
+            f"sticks={list(self.sticks)}, stages={list(self.config.stages)}, refine={list(self._refined)}, gradient={gradient}"
+        )
 
     def forward(
         self,
@@ -99,10 +116,27 @@ class CalibrationLayer(nn.Module):
 
         Raises:
             ConfigError: if the configuration's camera groups do not fit the cameras.
-            ObservationError: for arguments that are no arrays, whose shapes do not fit, or that do not fit the sticks, and
-                without an image size where it is needed. A session that cannot be calibrated is not an error but a status,
-                and the gradients by what was given of it are zero.
+            ObservationError: for arguments that are no arrays, whose shapes do not fit, or that do not fit the sticks, without
+                an image size where it is needed, and for values that nothing can have: a confidence outside [0, 1], a length
+                that is none, a matrix that is not a camera's. A session that cannot be calibrated because of its keypoints is
+                not an error but a status, and the gradients by what was given of it are zero.
+            CalibrationError: with ``on_failure="raise"`` for a session that cannot be calibrated; if the layer is to be
+                exported; and for forward-mode and second derivatives, which it does not have.
         """
+        return outside_graphs(CalibrationLayer._forward)(
+            self, keypoints, intrinsics, stick_lengths, confidence, initial, image_size
+        )
+
+    def _forward(
+        self,
+        keypoints: Any,
+        intrinsics: Any,
+        stick_lengths: Any,
+        confidence: Any,
+        initial: LayerResult | None,
+        image_size: Any,
+    ) -> LayerResult:
+        """As :meth:`forward`, never compiled."""
         keypoints = tensor_of(keypoints, "keypoints", masked=torch.nan, keep_graph=True)
         batched = keypoints.ndim == 5
         if "readout" in self._refined and image_size is None:
@@ -114,23 +148,28 @@ class CalibrationLayer(nn.Module):
             )
         keypoints = keypoints if batched else keypoints[None]
         given = LayerInputs.of(keypoints, intrinsics, stick_lengths, confidence, image_size, self.sticks, self.point_names)
-        if initial is not None and not batched:
-            initial = initial.each(lambda tensor: tensor[None])
         if initial is not None:
-            self._check_initial(initial, given)
+            initial = self._start(initial)
         with full_precision(keypoints.device):
-            result = self._calibrated(given, initial)
+            result = calibrated_in_any_transform(lambda given: self._calibrated(given, initial), given)
+        if self.on_failure == "raise":
+            _raise_failures(result.status)
         return result if batched else result.each(lambda tensor: tensor[0])
 
     def _calibrated(self, given: LayerInputs, initial: LayerResult | None) -> LayerResult:
         """All sessions; those that can be begun are solved side by side, a few at a time."""
         device, run = given.keypoints.device, Run(self.config)
+        if initial is not None:
+            self._check_initial(initial, given)
 
         def begun(session: int) -> Adjustment | str:
             try:
                 with torch.no_grad():
-                    return begin(given.observations(session), run, self._refined, start=initial and initial.warm_start(session))
+                    start = None if initial is None else initial.warm_start(session)
+                    return begin(given.observations(session), run, self._refined, start=start)
             except (ObservationError, RigError) as error:
+                if not is_of_session(error):
+                    raise _with_session(error, session) from error
                 return f"{type(error).__name__}: {error}"
 
         starts = dict(enumerate(map_on_workers(device, begun, range(len(given.keypoints)))))
@@ -171,6 +210,21 @@ class CalibrationLayer(nn.Module):
         no_gradient = given.no_gradient()
         return result.each(lambda tensor: tensor + no_gradient if tensor.is_floating_point() else tensor)
 
+    def _start(self, initial: LayerResult) -> LayerResult:
+        """An earlier result to start from, with the batch dimension, without gradients.
+
+        Raises:
+            ObservationError: if it is none, or a transform of torch.func has made it.
+        """
+        if not isinstance(initial, LayerResult) or is_transformed(initial):
+            raise ObservationError(
+                "not an earlier result to start from",
+                where="initial",
+                got="a result inside torch.func" if isinstance(initial, LayerResult) else type(initial).__name__,
+                expected="a result of this layer, made outside torch.func",
+            )
+        return initial.detach() if initial.batched else initial.detach().each(lambda tensor: tensor[None])
+
     def _check_initial(self, initial: LayerResult, given: LayerInputs) -> None:
         """Refuse a start from another batch, or with other unknowns.
 
@@ -187,6 +241,29 @@ class CalibrationLayer(nn.Module):
                 got=f"{got[0]} sessions, {got[1]} cameras, {got[2]} unknowns",
                 expected=f"{expected[0]} sessions, {expected[1]} cameras, {expected[2]} unknowns",
             )
+
+
+def _with_session(error: ObservationError | RigError, session: int) -> ObservationError:
+    """An error of an argument, which says of which session."""
+    where = f"{error.where} of session {session}"
+    return ObservationError(error.what, where=where, got=error.got, expected=error.expected, remedy=error.remedy)
+
+
+def _raise_failures(status: Sequence[str]) -> None:
+    """Refuse sessions that could not be calibrated.
+
+    Raises:
+        CalibrationError: if there are any.
+    """
+    failed = {session: said for session, said in enumerate(status) if said != "converged"}
+    if failed:
+        raise CalibrationError(
+            f"{len(failed)} of {len(status)} sessions could not be calibrated",
+            where=f"session {', '.join(map(str, failed))}",
+            got="; ".join(dict.fromkeys(failed.values())),
+            expected="sessions that converge",
+            remedy="With on_failure='status' such sessions have a status and zero gradients instead.",
+        )
 
 
 def _refined(config: Config) -> tuple[str, ...]:

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from typing import Any
 
 import torch
 from torch import Tensor
+from torch.utils import _pytree as pytree
 
 from torchstickcal.model.measurements import Measurements
 from torchstickcal.model.state import State
@@ -21,6 +22,11 @@ class LayerResult:
 
     Poses, lenses, clocks and points carry gradients, and have the dtype and device of the keypoints.
 
+    It behaves as a tensor does: ``result.detach()``, ``result.to(...)``, and for a batch ``len(result)``, ``result[2]`` (one
+    session), ``result[1:]`` (some sessions) and ``for session in result``. It is a pytree of ``torch.utils``: functions such as
+    ``torch.utils._pytree.tree_map`` and ``torch.func.vmap`` see its tensors. ``torch.save`` writes it, and ``torch.load`` reads
+    it with ``weights_only=True`` once this class has been imported.
+
     Example:
         >>> from torchstickcal import CalibrationLayer
         >>> from torchstickcal.simulate import golf_session
@@ -28,6 +34,8 @@ class LayerResult:
         >>> result = CalibrationLayer(observations.sticks)(observations.keypoints, observations.cameras)
         >>> result.status, result.points.shape
         (('converged',), torch.Size([10, 21, 3]))
+        >>> result.to(torch.float32).points.dtype
+        torch.float32
     """
 
     rotations: Tensor
@@ -103,10 +111,66 @@ class LayerResult:
             status=tuple(status),
         )
 
+    @staticmethod
+    def of_tensors(tensors: Mapping[str, Any], status: Sequence[str]) -> LayerResult:
+        """A result of what :meth:`tensors` gives, and the status of each session."""
+        every: dict[str, Any] = dict.fromkeys(_TENSORS)
+        return LayerResult(**every | dict(tensors), status=tuple(status))
+
     def each(self, function: Callable[[Tensor], Tensor]) -> LayerResult:
         """A result made of this one, tensor by tensor."""
+        return replace(self, **{name: function(tensor) for name, tensor in self.tensors().items()})
+
+    def tensors(self) -> dict[str, Tensor]:
+        """All tensors by their names, without a distortion of None."""
         tensors = {name: getattr(self, name) for name in _TENSORS}
-        return replace(self, **{name: tensor if tensor is None else function(tensor) for name, tensor in tensors.items()})
+        return {name: tensor for name, tensor in tensors.items() if tensor is not None}
+
+    def detach(self) -> LayerResult:
+        """The same values without gradients."""
+        return self.each(Tensor.detach)
+
+    def to(self, *arguments: Any, **keywords: Any) -> LayerResult:
+        """The same on another device or in another floating-point type; arguments as of ``torch.Tensor.to``."""
+        device = self.rotations.to(*arguments, **keywords).device
+        return self.each(lambda t: t.to(*arguments, **keywords) if t.is_floating_point() else t.to(device))
+
+    @property
+    def batched(self) -> bool:
+        """Whether the tensors have the leading B."""
+        return self.rotations.ndim == 4
+
+    def __len__(self) -> int:
+        """The number of sessions of a batch."""
+        self._check_batched()
+        return len(self.rotations)
+
+    def __getitem__(self, chosen: int | slice) -> LayerResult:
+        """One session of a batch, without the leading B, or several."""
+        self._check_batched()
+        numbers = range(len(self))[chosen]  # raises an IndexError for a session that does not exist
+        said = (self.status[numbers],) if isinstance(numbers, int) else tuple(self.status[number] for number in numbers)
+        place = numbers if isinstance(numbers, int) else list(numbers)
+        return replace(self.each(lambda tensor: tensor[place]), status=said)
+
+    def __iter__(self) -> Iterator[LayerResult]:
+        """The sessions of a batch."""
+        return (self[session] for session in range(len(self)))
+
+    def __bool__(self) -> bool:
+        """True for every result, also for one of no sessions."""
+        return True
+
+    def _check_batched(self) -> None:
+        """Refuse to count or choose sessions where there is no batch.
+
+        Raises:
+            TypeError: as Python and torch do.
+        """
+        if not self.batched:
+            raise TypeError(
+                "this is the result of one session, not of a batch: it has no length and no sessions to choose from"
+            )
 
     def warm_start(self, session: int) -> WarmStart | None:
         """Where a session may start from another time; None after a failure."""
@@ -137,3 +201,31 @@ class LayerResult:
 
 
 _TENSORS = [field.name for field in fields(LayerResult) if field.name != "status"]
+
+
+def _flattened(result: LayerResult) -> tuple[list[Any], Any]:
+    """The tensors of a result for torch's pytrees, and the rest."""
+    tensors = result.tensors()
+    return list(tensors.values()), (tuple(tensors), result.status)
+
+
+def _flattened_with_names(result: LayerResult) -> tuple[list[tuple[Any, Any]], Any]:
+    """The same, with a name for each tensor."""
+    values, rest = _flattened(result)
+    return [(pytree.GetAttrKey(name), value) for name, value in zip(rest[0], values, strict=True)], rest
+
+
+def _unflattened(values: Any, rest: Any) -> LayerResult:
+    """A result of tensors, or of whatever a function has put in their places."""
+    names, status = rest
+    return LayerResult.of_tensors(dict(zip(names, values, strict=True)), status)
+
+
+pytree.register_pytree_node(
+    LayerResult,
+    _flattened,
+    _unflattened,
+    serialized_type_name="torchstickcal.LayerResult",
+    flatten_with_keys_fn=_flattened_with_names,
+)
+torch.serialization.add_safe_globals([LayerResult])

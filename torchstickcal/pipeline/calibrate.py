@@ -26,7 +26,10 @@ _ = len(LOSSES), len(REFINEMENTS)  # imported now: a process that is forked whil
 
 
 class Callback(Protocol):
-    """What may listen to a calibration: a progress bar, TensorBoard, a test."""
+    """What may listen to a calibration: a progress bar, TensorBoard, a test.
+
+    A callback may also have a method ``on_start(observations)``, which is called before the first step.
+    """
 
     def on_iteration(self, record: IterationRecord) -> None:
         """After each iteration."""
@@ -94,6 +97,8 @@ def _calibrated(
     observations: Observations, config: Config, callback: Callback | None, left_out: tuple[str, ...] = ()
 ) -> Calibration:
     began = time.perf_counter()
+    if (on_start := getattr(callback, "on_start", None)) is not None:
+        on_start(observations)
     run = Run(config, callback.on_iteration if callback else ignore_record)
     models = ModelSelection(observations, run)
 

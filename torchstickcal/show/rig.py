@@ -10,13 +10,14 @@ import numpy as np
 import torch
 from matplotlib.figure import Figure
 from mpl_toolkits.mplot3d import Axes3D
+from mpl_toolkits.mplot3d.art3d import Line3DCollection
 from numpy.typing import NDArray
 from torch import Tensor
 
 from torchstickcal.geometry import se3
 from torchstickcal.result import Calibration
 
-_BONES = (
+BONES = (
     ("pelvis", "spine"), ("spine", "neck"), ("neck", "head"), ("head", "head_top"),
     *(
         (f"{side}_{a}" if a != "neck" and a != "pelvis" else a, f"{side}_{b}")
@@ -27,6 +28,7 @@ _BONES = (
         )
     ),
 )  # fmt: skip
+"""The bones that are drawn between points with these names."""
 _FRUSTUM_DEPTH = 0.09
 """Depth of the drawn camera pyramids, as a fraction of the largest distance between two cameras."""
 _MAX_STICK_FRAMES = 60
@@ -42,15 +44,15 @@ def rig_figure(calibration: Calibration, frame: int | None = None) -> Figure:
     """
     if frame is None:
         frame = int(calibration.points.isfinite().all(-1).sum(1).argmax())
-    rotation = _plot_rotation(calibration)
+    rotation = plot_rotation(calibration)
     points = _rotated(calibration.points, rotation)
-    corners = _rotated(_frusta(calibration), rotation)
+    corners = _rotated(frusta(calibration), rotation)
     figure = Figure(figsize=(9, 6), layout="tight")
     axes = cast(Axes3D, figure.add_subplot(projection="3d"))
     _draw_cameras(axes, calibration.camera_names, corners)
     _draw_sticks(axes, calibration, points, frame)
     _draw_athlete(axes, calibration, points[frame])
-    _equal_axes(axes, np.concatenate([corners.reshape(-1, 3), _without_extremes(points.reshape(-1, 3))]))
+    _equal_axes(axes, np.concatenate([corners.reshape(-1, 3), without_extremes(points.reshape(-1, 3))]))
     axes.set_xlabel("x (m)")
     axes.set_ylabel("y (m)")
     axes.set_zlabel("z (m)")
@@ -61,29 +63,31 @@ def rig_figure(calibration: Calibration, frame: int | None = None) -> Figure:
 
 def _draw_cameras(axes: Axes3D, names: Sequence[str], corners: NDArray[np.float64]) -> None:
     for name, (apex, *base) in zip(names, corners, strict=True):
-        for first, second in [*((apex, corner) for corner in base), *itertools.pairwise([*base, base[0]])]:
-            axes.plot(*np.stack([first, second]).T, color=_CAMERA_COLOUR, linewidth=1.2)
+        edges = [*((apex, corner) for corner in base), *itertools.pairwise([*base, base[0]])]
+        axes.add_collection3d(Line3DCollection(np.array(edges), colors=_CAMERA_COLOUR, linewidths=1.2))
         axes.text(apex[0], apex[1], apex[2], f" {name}", color=_CAMERA_COLOUR, fontsize=8)
 
 
 def _draw_sticks(axes: Axes3D, calibration: Calibration, points: NDArray[np.float64], frame: int) -> None:
     step = max(1, len(points) // _MAX_STICK_FRAMES)
     for stick in calibration.sticks:
-        for ends in points[::step, list(stick.ends)]:
-            axes.plot(*ends.T, color=_STICK_COLOUR, alpha=0.15, linewidth=0.8)
+        ends = points[::step, list(stick.ends)]
+        known = ends[np.isfinite(ends).all((1, 2))]
+        if len(known):
+            axes.add_collection3d(Line3DCollection(known, colors=_STICK_COLOUR, alpha=0.15, linewidths=0.8))
         axes.plot(*points[frame, list(stick.ends)].T, color=_STICK_COLOUR, linewidth=2.5)
 
 
 def _draw_athlete(axes: Axes3D, calibration: Calibration, points: NDArray[np.float64]) -> None:
     """Draw the points (P, 3) of one frame, and the bones between those with known names."""
     index = {name: number for number, name in enumerate(calibration.point_names or ())}
-    for first, second in _BONES:
-        if first in index and second in index:
-            axes.plot(*points[[index[first], index[second]]].T, color=_BODY_COLOUR, linewidth=1.8)
+    bones = np.array([points[[index[first], index[second]]] for first, second in BONES if first in index and second in index])
+    if len(bones):
+        axes.add_collection3d(Line3DCollection(bones[np.isfinite(bones).all((1, 2))], colors=_BODY_COLOUR, linewidths=1.8))
     axes.scatter(*points.T, color=_BODY_COLOUR, s=8, depthshade=False)
 
 
-def _plot_rotation(calibration: Calibration) -> Tensor:
+def plot_rotation(calibration: Calibration) -> Tensor:
     """Rotation (3, 3) from the world to the plot, where the mean up direction of the cameras is +z."""
     up = torch.nn.functional.normalize(-calibration.rotations.double().cpu()[:, 1].mean(0), dim=0)
     forward = calibration.rotations.double().cpu()[0, 2]
@@ -95,7 +99,7 @@ def _rotated(points: Tensor, rotation: Tensor) -> NDArray[np.float64]:
     return (points.detach().double().cpu() @ rotation.mT).numpy()
 
 
-def _frusta(calibration: Calibration) -> Tensor:
+def frusta(calibration: Calibration) -> Tensor:
     """Pyramid of each camera, (C, 5, 3): camera centre and the four image corners, in the world."""
     matrix = calibration.intrinsics.double()
     size = 2 * matrix[:, :2, 2] if calibration.image_size is None else calibration.image_size.double()
@@ -109,7 +113,7 @@ def _frusta(calibration: Calibration) -> Tensor:
     return in_camera @ rotations + se3.camera_centres(rotations, translations)[:, None]
 
 
-def _without_extremes(points: NDArray[np.float64]) -> NDArray[np.float64]:
+def without_extremes(points: NDArray[np.float64]) -> NDArray[np.float64]:
     """The points between the 2nd and 98th percentile of each coordinate. Wrongly triangulated points can be far away."""
     known = points[np.isfinite(points).all(1)]
     low, high = np.percentile(known, [2, 98], axis=0)

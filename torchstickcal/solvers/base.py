@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from enum import StrEnum
 from typing import Protocol
+
+from torch import Tensor
 
 from torchstickcal.model.objective import Objective
 from torchstickcal.model.state import State
@@ -69,6 +71,10 @@ class IterationRecord:
     """weighted root mean square reprojection error of each camera"""
     stick_length_m: float
     """mean length of the reconstructed sticks; NaN without sticks"""
+    rotations: Tensor | None = field(default=None, compare=False, repr=False)
+    """(C, 3, 3), world to camera; None in a record that was read from a file"""
+    translations: Tensor | None = field(default=None, compare=False, repr=False)
+    """(C, 3), world to camera, metres (in a first stage before the scale is known, in its own unit); likewise"""
 
 
 @dataclass(frozen=True)

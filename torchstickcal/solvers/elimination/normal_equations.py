@@ -248,6 +248,8 @@ class NormalEquations:
                 step_m=steps_m[session],
                 reprojection_px=tuple(pixels),
                 stick_length_m=lengths[session],
+                rotations=self.state.rotations[session],
+                translations=self.state.translations[session],
             )
             for session, pixels in enumerate(self.reprojection_px.tolist())
         ]
