@@ -76,7 +76,7 @@ def errors_by_camera(names: Sequence[str], errors: PoseErrors) -> dict[str, Any]
 
 
 def print_errors(errors: dict[str, Any]) -> None:
-    from torchstickcal.show.report import printable
+    from torchstickcal.show.tables import printable
 
     width = max(6, *(len(printable(camera["name"])) for camera in errors["cameras"]))
     print(f"{'camera':{width}}  rotation (deg)  translation (mm)")

@@ -25,9 +25,10 @@ from torchstickcal.metrics import pose_errors
 from torchstickcal.observations import Observations
 from torchstickcal.result import Calibration
 from torchstickcal.show.pictures import keypoints_figure, residuals_figure
-from torchstickcal.show.report import printable, table
+from torchstickcal.show.report import table
 from torchstickcal.show.rig import rig_figure
 from torchstickcal.show.scene import mesh_view, scene_mesh
+from torchstickcal.show.tables import printable
 from torchstickcal.solvers import IterationRecord
 
 if TYPE_CHECKING:
