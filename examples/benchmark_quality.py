@@ -10,13 +10,13 @@ from __future__ import annotations
 import argparse
 import collections
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
 
-from torchstickcal import Calibration, CalibrationError, Observations, Stick, calibrate
+from torchstickcal import CalibrationError, Observations, Stick, calibrate
 from torchstickcal.geometry import se3
 from torchstickcal.geometry.cameras import Intrinsics
 from torchstickcal.metrics import pose_errors
@@ -28,7 +28,9 @@ LAYOUTS = ("ring", "hemisphere", "random", "arena")
 FOCAL_PX = 1200.0
 
 
-def session(number: int, rng: np.random.Generator, cameras: int | None = None, outliers: float | None = None) -> SimulatedSession:
+def session(
+    number: int, rng: np.random.Generator, cameras: int | None = None, outliers: float | None = None
+) -> SimulatedSession:
     """A session with the errors of a detector."""
     return SessionSpec(
         f"session{number}",
@@ -223,9 +225,7 @@ KINDS: dict[str, Kind] = {
     "one camera's intrinsics of half resolution": Kind(
         lambda s, c, r: without_size(with_matrix(s.observations, [c], scaled(0.5))), LENS
     ),
-    "one camera's intrinsics of double resolution": Kind(
-        lambda s, c, r: with_matrix(s.observations, [c], scaled(2.0)), LENS
-    ),
+    "one camera's intrinsics of double resolution": Kind(lambda s, c, r: with_matrix(s.observations, [c], scaled(2.0)), LENS),
     "all intrinsics of half resolution": Kind(
         lambda s, c, r: with_matrix(s.observations, list(range(s.observations.num_cameras)), scaled(0.5)), LENS
     ),
@@ -264,13 +264,18 @@ KINDS: dict[str, Kind] = {
     "one camera 8 frames late": Kind(lambda s, c, r: later(s, c, 8), CLOCK),
     "one camera lost 6 frames": Kind(lambda s, c, r: dropped(s, c, s.observations.num_frames // 2, 6), (*CLOCK, *MOVED)),
     "stick given in feet": Kind(
-        lambda s, c, r: s.observations.with_stick_length(s.observations.sticks[0].length_m * 3.28), ("athlete_height",), cameras=2
+        lambda s, c, r: s.observations.with_stick_length(s.observations.sticks[0].length_m * 3.28),
+        ("athlete_height",),
+        cameras=2,
     ),
     "stick given half as long": Kind(
         lambda s, c, r: s.observations.with_stick_length(s.observations.sticks[0].length_m / 2), ("athlete_height",), cameras=2
     ),
     "stick given 5 % too long": Kind(
-        lambda s, c, r: s.observations.with_stick_length(s.observations.sticks[0].length_m * 1.05), (), tellable=False, cameras=2
+        lambda s, c, r: s.observations.with_stick_length(s.observations.sticks[0].length_m * 1.05),
+        (),
+        tellable=False,
+        cameras=2,
     ),
     "sticks that contradict each other": Kind(lambda s, c, r: wrong_forearm(s), ("stick_lengths_contradict",), cameras=2),
     "missing keypoints at (0, 0)": Kind(lambda s, c, r: corner(s, c, r), ("keypoints_at_corner",)),
@@ -346,7 +351,10 @@ def sound(count: int, seed: int) -> None:
     print(f"\nSound sessions: {count}; {dict(verdicts)}; false alarms (poor or failed): {alarms / count:.1%}")
     print(f"findings above notes: {dict(usable)}")
     print(f"confidently wrong: {sum(o.confidently_wrong for o in outcomes)}")
-    print(f"time of the judgement over that of the calibration: median {np.median(share):.1%}, mean {np.mean(share):.1%}", flush=True)
+    print(
+        f"time of the judgement over that of the calibration: median {np.median(share):.1%}, mean {np.mean(share):.1%}",
+        flush=True,
+    )
 
 
 def bad(count: int, seed: int) -> None:
@@ -366,7 +374,9 @@ def bad(count: int, seed: int) -> None:
         outcomes[chosen[0]].append(outcome)
         if outcome.confidently_wrong or not outcome.right:
             print("   ", number, chosen[0], "cam", camera, outcome, flush=True)
-    print(f"\n{'kind of bad session':46} {'n':>3} {'good':>5} {'usable':>6} {'poor':>5} {'failed':>6} {'refused':>7} {'conf. wrong':>11} cause")
+    print(
+        f"\n{'kind of bad session':46} {'n':>3} {'good':>5} {'usable':>6} {'poor':>5} {'failed':>6} {'refused':>7} {'conf. wrong':>11} cause"
+    )
     wrong = told = right = 0
     for name, found in outcomes.items():
         verdicts = collections.Counter(outcome.verdict for outcome in found)
@@ -376,7 +386,10 @@ def bad(count: int, seed: int) -> None:
         print(f"{name:46} {len(found):3} {row[0]:5} {row[1]:6} {row[2]:5} {row[3]:6} {row[4]:7} {own:11} {said}")
         if KINDS[name].tellable:
             wrong, told, right = wrong + own, told + len(named), right + sum(named)
-    print(f"confidently wrong, of the kinds that can be told: {wrong}; right cause first: {right / max(told, 1):.0%} of {told}", flush=True)
+    print(
+        f"confidently wrong, of the kinds that can be told: {wrong}; right cause first: {right / max(told, 1):.0%} of {told}",
+        flush=True,
+    )
 
 
 def steps(count: int, seed: int) -> None:
@@ -397,7 +410,9 @@ def steps(count: int, seed: int) -> None:
         near = any(abs(f.frames[0] - frame) <= 2 for f in own if f.frames)
         label = f"{turn:g} degrees" if turn else f"{1000 * shift:g} mm"
         found[label].append((bool(said), bool(own), near))
-    print(f"\nSteps of one camera, of {count} sessions of 60 to 160 frames, 3 to 8 cameras; false steps in sound ones: {false / count:.1%}")
+    print(
+        f"\nSteps of one camera, of {count} sessions of 60 to 160 frames, 3 to 8 cameras; false steps in sound ones: {false / count:.1%}"
+    )
     print(f"{'step':14} {'n':>4} {'found':>6} {'right camera':>13} {'and within 2 frames':>20}")
     for label, values in found.items():
         rates = np.mean(values, axis=0)
@@ -438,7 +453,12 @@ def lengths(count: int, seed: int) -> None:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else "")
-    for name, help in (("sound", "sound sessions"), ("bad", "bad sessions"), ("steps", "sessions with a step"), ("lengths", "")):
+    for name, help in (
+        ("sound", "sound sessions"),
+        ("bad", "bad sessions"),
+        ("steps", "sessions with a step"),
+        ("lengths", ""),
+    ):
         parser.add_argument(f"--{name}", type=int, default=0, metavar="N", help=help)
     parser.add_argument("--seed", type=int, default=0)
     options = parser.parse_args()

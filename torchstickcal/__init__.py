@@ -18,6 +18,9 @@ if TYPE_CHECKING:
     from torchstickcal.layer.result import LayerResult
     from torchstickcal.observations import Observations
     from torchstickcal.pipeline.calibrate import Callback, calibrate
+    from torchstickcal.quality.check import check
+    from torchstickcal.quality.finding import Finding, Severity
+    from torchstickcal.quality.verdict import Quality, Verdict
     from torchstickcal.result import Calibration
     from torchstickcal.show.tensorboard import TensorBoardMonitor
     from torchstickcal.solvers.gradients import GaussNewton, GradientMode, Implicit, Unrolled
@@ -34,6 +37,7 @@ _HOMES = {
     "ConfigError": "errors",
     "Extrinsics": "extrinsics",
     "FileFormatError": "errors",
+    "Finding": "quality.finding",
     "GaussNewton": "solvers.gradients",
     "GradientMode": "solvers.gradients",
     "Implicit": "solvers.gradients",
@@ -41,11 +45,15 @@ _HOMES = {
     "LayerResult": "layer.result",
     "ObservationError": "errors",
     "Observations": "observations",
+    "Quality": "quality.verdict",
     "RigError": "errors",
+    "Severity": "quality.finding",
     "Stick": "stick",
     "TensorBoardMonitor": "show.tensorboard",
     "Unrolled": "solvers.gradients",
+    "Verdict": "quality.verdict",
     "calibrate": "pipeline.calibrate",
+    "check": "quality.check",
     "config_names": "config",
     "load_config": "config",
 }
@@ -60,6 +68,7 @@ __all__ = [
     "ConfigError",
     "Extrinsics",
     "FileFormatError",
+    "Finding",
     "GaussNewton",
     "GradientMode",
     "Implicit",
@@ -67,11 +76,15 @@ __all__ = [
     "LayerResult",
     "ObservationError",
     "Observations",
+    "Quality",
     "RigError",
+    "Severity",
     "Stick",
     "TensorBoardMonitor",
     "Unrolled",
+    "Verdict",
     "calibrate",
+    "check",
     "config_names",
     "load_config",
 ]

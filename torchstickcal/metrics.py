@@ -28,6 +28,8 @@ class PoseErrors:
     """(..., C)"""
     translation_m: Tensor
     """(..., C), distance of the camera centres"""
+    aligned_by: str = "camera centres"
+    """what was laid onto the truth before the comparison, by a rotation and a translation without scale"""
 
     @property
     def mean_rotation_deg(self) -> float:
@@ -80,8 +82,7 @@ def pose_errors(
     by_first = r_true[..., 0, :, :].mT @ r[..., 0, :, :]
     scale = centres.new_ones(())
     if alignment in ("rigid", "similarity"):
-        spread = torch.linalg.svdvals((true_centres - true_centres.mean(-2, keepdim=True)).detach())
-        collinear = (spread[..., 1] <= _COLLINEAR * spread[..., 0])[..., None, None]
+        collinear = _collinear(true_centres)[..., None, None]
         by_centres, _ = align(centres, true_centres)
         rotation = by_first.where(collinear, by_centres)
         moved = centres @ rotation.mT
@@ -102,7 +103,26 @@ def pose_errors(
     return PoseErrors(
         rotation_deg=rotation_angle(r_true @ rotation[..., None, :, :] @ r.mT).rad2deg(),
         translation_m=(laid - true_centres).norm(dim=-1),
+        aligned_by=_aligned_by(alignment, true_centres),
     )
+
+
+def _aligned_by(alignment: Alignment, true_centres: Tensor) -> str:
+    """What was laid onto the truth, in words."""
+    scale = "and scale" if alignment == "similarity" else "no scale"
+    if alignment == "none":
+        return "nothing: the worlds are the same"
+    if alignment == "first_camera":
+        return "pose of the first camera, rotation and translation, no scale"
+    if bool(_collinear(true_centres).all()):
+        return f"pose of the first camera, rotation and translation, {scale} (the camera centres lie on one line)"
+    return f"all {true_centres.shape[-2]} camera centres, rotation and translation, {scale}"
+
+
+def _collinear(centres: Tensor) -> Tensor:
+    """Whether camera centres (..., C, 3) lie on one line, (...)."""
+    spread = torch.linalg.svdvals((centres - centres.mean(-2, keepdim=True)).detach())
+    return spread[..., 1] <= _COLLINEAR * spread[..., 0]
 
 
 class PoseErrorMetric:

@@ -218,6 +218,28 @@ class Observations:
             camera_names=[self.camera_label(camera) for camera in own],
         )
 
+    def with_camera_split(self, camera: int, frame: int) -> Observations:
+        """The same observations with a camera that moved as two: one up to a frame, and a further last one from it on.
+
+        A calibration then gives both of its places.
+
+        Args:
+            camera: index of the camera.
+            frame: the first frame after it moved.
+
+        Raises:
+            ObservationError: if there is no such camera, or no frame before or after.
+        """
+        if not 0 < frame < self.num_frames:
+            raise ObservationError(
+                "a camera cannot be split there", where="frame", got=frame, expected=f"a frame from 1 to {self.num_frames - 1}"
+            )
+        both = self.of_cameras([*range(self.num_cameras), camera])
+        keypoints = both.keypoints.clone()
+        keypoints[camera, frame:], keypoints[-1, :frame] = torch.nan, torch.nan
+        names = [*self.camera_labels, f"{self.camera_label(camera)} from frame {frame}"]
+        return replace(both, keypoints=keypoints, camera_names=names)
+
     def with_stick_length(self, length_m: float) -> Observations:
         """The same observations with another length for their only stick.
 

@@ -28,7 +28,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
     Returns:
         The exit status: 0, 1 if a calibration did not converge, 2 if the input cannot be used or the results cannot be written,
-        130 if the user interrupted it.
+        3 if the verdict on a calibration is poor or failed, 130 if the user interrupted it.
     """
     try:
         with console():

@@ -8,6 +8,7 @@ from typing import Any, NoReturn
 
 from torchstickcal.cli.benchmark import benchmark
 from torchstickcal.cli.calibrate import calibrate_session
+from torchstickcal.cli.check import check_session
 from torchstickcal.cli.evaluate import evaluate
 from torchstickcal.cli.listing import LISTS, list_names
 from torchstickcal.cli.outputs import EXIT_UNUSABLE
@@ -33,7 +34,7 @@ def parser() -> argparse.ArgumentParser:
         description="Calibrate a camera rig, in metres, from an athlete's keypoints and a stick of known length.",
     )
     commands = parser.add_subparsers(metavar="COMMAND", required=True)
-    for add in (_add_calibrate, _add_evaluate, _add_benchmark, _add_simulate, _add_demo, _add_list):
+    for add in (_add_calibrate, _add_check, _add_evaluate, _add_benchmark, _add_simulate, _add_demo, _add_list):
         add(commands)
     return parser
 
@@ -67,8 +68,38 @@ def _add_calibrate(commands: Any) -> None:
         "--export", metavar="A,B", help="write the calibration also in these formats, from `torchstickcal list formats`"
     )
     command.add_argument("--tensorboard", metavar="DIR", type=_path, help="write a TensorBoard log of the calibration")
+    command.add_argument(
+        "--split-moved", action="store_true", help="if a camera moved, calibrate again with its places before and after as two"
+    )
+    _add_strict(command)
     _add_plugin(command)
     command.set_defaults(run=calibrate_session)
+
+
+def _add_check(commands: Any) -> None:
+    command = commands.add_parser(
+        "check",
+        help="is an old calibration still valid for a new session of the same cameras?",
+        description="Say whether an old calibration is still valid for a new session of the same cameras: which camera moved, how "
+        "far, and since when. The exit status is 0 if it is valid, 3 if it is not.",
+    )
+    command.add_argument(
+        "calibration", metavar="CALIBRATION", type=_path, help="folder that `calibrate` wrote, or a calibration file"
+    )
+    command.add_argument(
+        "session", metavar="SESSION", type=_path, nargs="+", help="file or folder of a session; or one file for each camera"
+    )
+    _add_format(command, "SESSION")
+    _add_given(command)
+    command.add_argument("--json", metavar="FILE", type=_path, help="write the verdict and the findings as JSON")
+    command.add_argument(
+        "--units",
+        choices=("m", "cm", "mm"),
+        help="unit of length of a calibration file that does not say it (aniposelib, COLMAP)",
+    )
+    _add_strict(command)
+    _add_plugin(command)
+    command.set_defaults(run=check_session)
 
 
 def _add_evaluate(commands: Any) -> None:
@@ -162,6 +193,10 @@ def _add_out(command: argparse.ArgumentParser, what: str) -> None:
     command.add_argument("--out", metavar="DIR", type=_path, required=True, help=help)
 
 
+def _add_strict(command: argparse.ArgumentParser) -> None:
+    command.add_argument("--strict", action="store_true", help="count the verdict `usable` as poor: exit status 3 instead of 0")
+
+
 def _add_config(command: argparse.ArgumentParser) -> None:
     help = "name from `torchstickcal list configs`, or a TOML file (default: default)"
     command.add_argument("--config", metavar="NAME|FILE", default="default", help=help)
@@ -205,6 +240,6 @@ def _add_plugin(command: argparse.ArgumentParser) -> None:
         metavar="MODULE|FILE.py",
         action="append",
         default=[],
-        help="a Python module of yours that registers losses, camera unknowns, file formats, sports or baselines; may be given "
+        help="a Python module of yours that registers losses, camera unknowns, findings, file formats, sports or baselines; may be given "
         "several times. It is a program that is run with your rights: use only what you trust",
     )

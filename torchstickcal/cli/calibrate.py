@@ -32,17 +32,28 @@ def calibrate_session(options: argparse.Namespace) -> int:
     try_writing(options.out, result_names(writers))
     if options.tensorboard is not None:
         try_writing(options.tensorboard, where="--tensorboard")
-    session = load_session(options.session, options.format, _given(options))
+    session = load_session(options.session, options.format, given_of(options))
     for note in session.notes:
         print(f"note: {note}", file=sys.stderr)
     observations = _with_stick(session.observations, options.stick_length, options.stick_sigma)
     calibration = calibrate(observations, config, Progress(_monitor(options.tensorboard)), refine)
+    if options.split_moved and (split := _split(observations, calibration)) is not None:
+        calibration = calibrate(split, config, Progress(_monitor(options.tensorboard)), refine)
     with atomic_set(options.out) as folder:
         write_results(calibration, folder, writers, _provenance(options, session.notes))
-    return show_results(calibration, options.out, writers)
+    return show_results(calibration, options.out, writers, options.strict)
 
 
-def _given(options: argparse.Namespace) -> Given:
+def _split(observations: Observations, calibration: Calibration) -> Observations | None:
+    """The observations with the camera that moved as two; None if none moved at some frame."""
+    for finding in calibration.quality.findings:
+        if finding.code == "camera_moved" and finding.frames and finding.cameras:
+            camera = observations.camera_labels.index(finding.cameras[0])
+            return observations.with_camera_split(camera, finding.frames[0])
+    return None
+
+
+def given_of(options: argparse.Namespace) -> Given:
     """What the options say of a recording.
 
     Raises:

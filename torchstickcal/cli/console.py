@@ -26,6 +26,23 @@ def console() -> Iterator[None]:
             out.flush()
 
 
+def print_coloured(before: str, word: str, colour: str, after: str) -> None:
+    """Print a line with one coloured word on a terminal, without the colour elsewhere.
+
+    Args:
+        before: text before the word.
+        word: the word.
+        colour: parameters of the terminal's sequence SGR, such as ``31``.
+        after: text after it.
+    """
+    print(before, end="")
+    if isinstance(sys.stdout, _Stream) and sys.stdout.isatty():
+        sys.stdout.write_coloured(word, colour)
+    else:
+        print(word, end="")
+    print(after)
+
+
 class _Stream(io.TextIOBase):
     """A text stream that escapes what its encoding does not have; None for one that is closed."""
 
@@ -38,6 +55,10 @@ class _Stream(io.TextIOBase):
             shown = text.translate(_CONTROLS).encode(encoding, "backslashreplace").decode(encoding)
             self._tried(lambda stream: stream.write(shown))
         return len(text)
+
+    def write_coloured(self, word: str, colour: str) -> None:
+        """Write a word of the program's own in a colour."""
+        self._tried(lambda stream: stream.write(f"\x1b[{colour}m{word}\x1b[0m"))
 
     def flush(self) -> None:
         self._tried(lambda stream: stream.flush())

@@ -19,8 +19,8 @@ def evaluate(options: argparse.Namespace) -> int:
     from torchstickcal.metrics import pose_errors
 
     try_json(options.json)
-    names, estimate = _poses(options.calibration, None, options.units)
-    truth_names, truth = _poses(options.truth, options.format, options.units)
+    names, estimate = poses_of(options.calibration, None, options.units)
+    truth_names, truth = poses_of(options.truth, options.format, options.units)
     if len(names) != len(truth_names):
         raise CalibrationError(
             "the number of cameras differs",
@@ -38,7 +38,7 @@ def evaluate(options: argparse.Namespace) -> int:
     return EXIT_DONE
 
 
-def _poses(path: Path, format: str | None, units: str | None) -> tuple[tuple[str, ...], Truth]:
+def poses_of(path: Path, format: str | None, units: str | None) -> tuple[tuple[str, ...], Truth]:
     """Names and poses of the cameras of a calibration, or of a session that holds its truth.
 
     Args:

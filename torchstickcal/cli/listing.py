@@ -50,6 +50,13 @@ def _formats() -> Iterator[tuple[str, str]]:
         yield name, f"writes {writer.file_name}: {writer.description}"
 
 
+def _findings() -> Iterator[tuple[str, str]]:
+    from torchstickcal.quality.registry import FAMILIES
+
+    for name, family in FAMILIES.items():
+        yield name, family.description
+
+
 def _sports() -> Iterator[tuple[str, str]]:
     from torchstickcal.simulate import SPORTS
 
@@ -91,6 +98,7 @@ def _configs() -> Iterator[tuple[str, str]]:
 LISTS: dict[str, tuple[str, Callable[[], Iterator[tuple[str, str]]]]] = {
     "losses": ("keys in the table of a stage of a configuration", _losses),
     "unknowns": ("for --refine, and the key `refine` of a configuration", _unknowns),
+    "findings": ("families of what is found of a calibration, for its verdict", _findings),
     "formats": ("files that can be read (--format takes those of sessions and keypoints) and written (--export)", _formats),
     "sports": ("for simulate", _sports),
     "presets": ("sets of sessions, for simulate and benchmark", _presets),

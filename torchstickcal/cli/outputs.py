@@ -7,14 +7,16 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from torchstickcal.cli.console import print_coloured
 from torchstickcal.errors import CalibrationError
 
 if TYPE_CHECKING:
     from torchstickcal.io import Writer
     from torchstickcal.metrics import PoseErrors
+    from torchstickcal.quality.verdict import Quality
     from torchstickcal.result import Calibration
 
-EXIT_DONE, EXIT_NOT_CONVERGED, EXIT_UNUSABLE, EXIT_INTERRUPTED = 0, 1, 2, 130
+EXIT_DONE, EXIT_NOT_CONVERGED, EXIT_UNUSABLE, EXIT_POOR, EXIT_INTERRUPTED = 0, 1, 2, 3, 130
 CAMERAS_FORMAT = "pose2sim"
 CAMERAS_FILE, POINTS_FILE, REPORT_FILE = "calibration.toml", "points.npz", "report.json"
 
@@ -54,21 +56,40 @@ def write_results(calibration: Calibration, folder: Path, writers: dict[str, Wri
     write_json(folder / REPORT_FILE, provenance | summary(calibration))
 
 
-def show_results(calibration: Calibration, folder: Path, writers: dict[str, Writer]) -> int:
+def show_results(calibration: Calibration, folder: Path, writers: dict[str, Writer], strict: bool = False) -> int:
     from torchstickcal.show.report import table
 
-    print(table(calibration))
+    show_quality(calibration.quality)
+    print(f"\n{table(calibration)}")
     print(f"\n{', '.join(result_names(writers))} in {folder}")
-    if calibration.converged:
-        return EXIT_DONE
-    print(f"not converged: {calibration.status}", file=sys.stderr)
-    return EXIT_NOT_CONVERGED
+    if not calibration.converged:
+        print(f"not converged: {calibration.status}", file=sys.stderr)
+        return EXIT_NOT_CONVERGED
+    return exit_status(calibration.quality, strict)
+
+
+def show_quality(quality: Quality, notes: bool = False) -> None:
+    """The verdict first, in words and colour, then why."""
+    from torchstickcal.show.quality import colour_of, meaning_of, reasons_text
+
+    print_coloured("verdict: ", quality.verdict.value, colour_of(quality.verdict), f" ({meaning_of(quality.verdict)})")
+    if reasons := reasons_text(quality, notes):
+        print(reasons)
+
+
+def exit_status(quality: Quality, strict: bool) -> int:
+    """0 for good and usable, 3 for poor and failed; where it is strict, also for usable."""
+    from torchstickcal.quality.verdict import Verdict
+
+    accepted = (Verdict.GOOD,) if strict else (Verdict.GOOD, Verdict.USABLE)
+    return EXIT_DONE if quality.verdict in accepted else EXIT_POOR
 
 
 def errors_by_camera(names: Sequence[str], errors: PoseErrors) -> dict[str, Any]:
     """The errors as a dictionary that can be written as JSON."""
     rows = zip(names, errors.rotation_deg.tolist(), errors.translation_m.tolist(), strict=True)
     return {
+        "aligned_by": errors.aligned_by,
         "mean_rotation_deg": errors.mean_rotation_deg,
         "mean_translation_m": errors.mean_translation_m,
         "cameras": [{"name": n, "rotation_deg": rotation, "translation_m": translation} for n, rotation, translation in rows],
@@ -79,6 +100,7 @@ def print_errors(errors: dict[str, Any]) -> None:
     from torchstickcal.show.tables import printable
 
     width = max(6, *(len(printable(camera["name"])) for camera in errors["cameras"]))
+    print(f"aligned before the comparison: {errors['aligned_by']}")
     print(f"{'camera':{width}}  rotation (deg)  translation (mm)")
     mean = {"name": "mean", "rotation_deg": errors["mean_rotation_deg"], "translation_m": errors["mean_translation_m"]}
     for camera in [*errors["cameras"], mean]:

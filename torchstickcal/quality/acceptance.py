@@ -8,6 +8,7 @@ frames.
 
 from __future__ import annotations
 
+import itertools
 from typing import NamedTuple
 
 import torch
@@ -29,6 +30,8 @@ _MOST_FRAMES = 1000
 _LEAST_LENGTHS = 5
 _TRIANGULATIONS = 2
 _SIGMAS = 1.96
+_WRONG_SIGMAS = 6.0
+"""Error of a length, in its standard deviations, from which on a keypoint of its ends is simply wrong."""
 
 
 def accepted(ended: Adjustment, noise: Tensor, ruler: Tensor) -> Acceptance | None:
@@ -83,6 +86,10 @@ class Prediction(NamedTuple):
         given = float(part.measurements.lengths_m[0, self.stick])
         errors = self.length_m[known] - given
         std = (self.by_keypoints_m.square() + self.by_cameras_m.square()).sqrt()[known]
+        right = errors.abs() <= _WRONG_SIGMAS * std
+        if int(right.sum()) < _LEAST_LENGTHS:
+            right = torch.ones_like(right)
+        inside = float((errors.abs() <= _SIGMAS * std).double().mean())
         places = self.ends[..., known].movedim(1, -1).flatten(0, 1)
         axes = torch.linalg.svd(places - places.mean(0), full_matrices=False).Vh
         along = (places - places.mean(0)) @ axes.mT
@@ -91,10 +98,11 @@ class Prediction(NamedTuple):
             stick=" - ".join(map(part.observations[0].point_label, stick)),
             given_m=given,
             frames=len(errors),
-            largest_m=float(errors[errors.abs().argmax()]),
-            mean_m=float(errors.mean()),
-            std_m=float(errors.std()),
-            inside=float((errors.abs() <= _SIGMAS * std).double().mean()),
+            wrong=int((~right).sum()),
+            largest_m=float(errors[right][errors[right].abs().argmax()]),
+            mean_m=float(errors[right].mean()),
+            std_m=float(errors[right].std()),
+            inside=inside,
             volume_m=(x, y, z),
         )
 
@@ -150,7 +158,7 @@ def _shifts_without_folds(part: Adjustment, kept: Measurements) -> list[tuple[sl
     everything = solve_information(information, gradient)
     bounds = [kept.frames * number // _FOLDS for number in range(_FOLDS + 1)]
     found: list[tuple[slice, Tensor]] = []
-    for start, stop in zip(bounds, bounds[1:], strict=False):
+    for start, stop in itertools.pairwise(bounds):
         if stop == start:
             continue
         window = slice(start, stop)

@@ -27,6 +27,8 @@ from torchstickcal.solvers.uncertainty import centre_covariances, relative_scale
 _CONSISTENT_SHARE, _BEHIND_OTHERS, _NOISY_MRAD = 0.62, 0.85, 10.0
 """Least share of a camera's keypoints that agree, also over that of the median camera, and noise of the keypoints, of a rig whose
 cameras see one scene. Sound cameras keep 84 % and more, with 20 % of wrong keypoints 66 %."""
+_NEAR_FOCAL = 0.3
+"""Logarithm of an estimated over the given focal length: from here on, something else is wrong."""
 _OTHER_PERSON_SHARE = 0.2
 """Share of a camera's frames that were set aside as those of another person, from which on the camera itself is doubted."""
 
@@ -109,7 +111,9 @@ class Evidence:
         least, median = float(self.agreement.min()), float(self.agreement.median())
         agree = least > max(_CONSISTENT_SHARE, _BEHIND_OTHERS * median)
         person = float(self.ended.labels.other_person[0].double().mean(1).max()) < _OTHER_PERSON_SHARE
-        return self.ended.converged and agree and person and self.noise_mrad < _NOISY_MRAD
+        focal = self.measurements.cameras_at(self.state).focal_px[0] / self.measurements.cameras.focal_px[0]
+        near = not self.observations.intrinsics_known or float(focal.log().abs().max()) < _NEAR_FOCAL
+        return self.ended.converged and agree and person and near and self.noise_mrad < _NOISY_MRAD
 
     @cached_property
     def centres(self) -> Tensor:
@@ -176,7 +180,7 @@ class Evidence:
         for unknown, squared in self.contradictions.items():
             family = all_unknowns()[unknown].family
             strengths[family] = max(strengths.get(family, 0.0), float(squared.max()))
-        return self.consistent and strengths[name] >= max(strengths.values())
+        return strengths[name] >= max(strengths.values())
 
     @cached_property
     def acceptance(self) -> Acceptance | None:

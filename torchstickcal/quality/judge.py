@@ -15,8 +15,14 @@ def judged(evidence: Evidence) -> Quality:
 
 
 def _judged(evidence: Evidence) -> Quality:
-    found = [finding for family in FAMILIES.values() if not family.tries for finding in family.look(evidence)]
-    wrong = any(finding.severity >= Severity.SERIOUS for finding in found)
-    if wrong and not (evidence.consistent and any(finding.is_cause for finding in found)):
-        found += [finding for family in FAMILIES.values() if family.tries for finding in family.look(evidence)]
-    return Quality.of(found, evidence.acceptance)
+    first = [family for family in FAMILIES.values() if not family.tries]
+    found = {family: list(family.look(evidence)) for family in first}
+    every = [finding for own in found.values() for finding in own]
+    wrong = any(finding.severity >= Severity.SERIOUS for finding in every)
+    told = evidence.consistent and any(finding.is_cause for finding in every)
+    if (wrong or not evidence.consistent) and not told:
+        causes = [finding for family in FAMILIES.values() if family.tries for finding in family.look(evidence)]
+        if causes:
+            every = [finding for family, own in found.items() if not family.small for finding in own]
+        every = [*causes, *every]
+    return Quality.of(every, evidence.acceptance)

@@ -22,24 +22,29 @@ class Family:
         description: one line, for lists.
         look: finds them.
         tries: whether it tries to explain what others found. It is asked only where something is wrong.
+        small: whether its findings are small errors, told by linearising. They are not said where a trial finds a larger one.
     """
 
     description: str
     look: Look
     tries: bool = False
+    small: bool = False
 
 
 FAMILIES: Registry[Family] = Registry("family of findings", "torchstickcal.quality.findings")
 """The families of findings, by name."""
 
 
-def findings(name: str, description: str, *, tries: bool = False, replace: bool = False) -> Callable[[Look], Look]:
+def findings(
+    name: str, description: str, *, tries: bool = False, small: bool = False, replace: bool = False
+) -> Callable[[Look], Look]:
     """Register a function that makes findings, as a decorator.
 
     Args:
         name: of the family.
         description: one line, for lists.
         tries: whether it tries to explain what others found. It is asked only where the verdict is poor or failed.
+        small: whether its findings are small errors, told by linearising. They are not said where a trial finds a larger one.
         replace: whether it may take the place of another of that name.
 
     Raises:
@@ -56,7 +61,7 @@ def findings(name: str, description: str, *, tries: bool = False, replace: bool 
     def register(look: Look) -> Look:
         if not callable(look):
             raise ConfigError("not a function", where=f"findings({name!r})", got=look, expected="a function of an Evidence")
-        FAMILIES.register(name, Family(description, look, tries), replace=replace)
+        FAMILIES.register(name, Family(description, look, tries, small), replace=replace)
         return look
 
     return register

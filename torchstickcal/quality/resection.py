@@ -20,7 +20,7 @@ _MOST_POINTS, _LEAST_POINTS = 400, 12
 _ROUNDS, _REACH_SIGMAS = 400, 8.0
 _STEPS = 12
 _KERNEL_SIGMAS = 6.0
-AGREEING_SIGMAS = 6.0
+AGREEING_SIGMAS = 4.5
 """Distance in the image within which a keypoint agrees with a point that has an error of its own."""
 
 
@@ -68,7 +68,7 @@ def resected(
         in_camera = se3.moved(rotation[None, None], translation[None, None], points[None])
         weights = information * (in_camera[0, 0, 2] > 0)
         terms = loss.linearise(in_camera, rotation[None, None], pixels[None, None], weights[None, None], batch)
-        gradient, rows = terms.gradient[0, 0], cross_rows(terms.hessian[0], points[None])[0, 0]
+        gradient, rows = terms.gradient[0, 0], cross_rows(terms.hessian, points[None])[0, 0]
         pull = torch.cat([gradient, torch.linalg.cross(points, gradient, dim=0)]).sum(-1)
         turned = torch.linalg.cross(points.expand(6, 3, -1), rows, dim=1)
         moments = torch.cat([rows, turned], dim=1).sum(-1)

@@ -16,7 +16,7 @@ from torchstickcal.observations import Observations
 from torchstickcal.pipeline.adjust import Adjustment, adjust_cameras, begin
 from torchstickcal.pipeline.run import Run
 from torchstickcal.quality.evidence import Evidence
-from torchstickcal.quality.resection import Resection, resected
+from torchstickcal.quality.resection import AGREEING_SIGMAS, Resection, resected
 
 _SCALES = (1 / 3, 0.5, 2 / 3, 0.75, 4 / 3, 1.5, 2.0, 3.0)
 """Ratios of resolutions that videos are commonly converted by."""
@@ -223,5 +223,5 @@ def _agreeing(placed: Resection, rest: Rest, sight: Sight, usable: Tensor) -> Te
     """(F, P), the keypoints that agree with a camera at some place."""
     in_camera = torch.einsum("ij,jfp->fpi", placed.rotation, rest.points) + placed.translation
     pixels = sight.camera.project(in_camera.nan_to_num().flatten(0, 1)[None])[0].view(*usable.shape, 2)
-    near = (pixels - sight.keypoints).norm(dim=-1) < 6.0 * rest.sigma_px
+    near = (pixels - sight.keypoints).norm(dim=-1) < AGREEING_SIGMAS * rest.sigma_px
     return near & usable & (in_camera[..., 2] > 0)

@@ -44,6 +44,8 @@ class LengthErrors:
     given_m: float
     frames: int
     """number of lengths"""
+    wrong: int
+    """number of them that are wrong, by more than 6 of their standard deviations: they are in ``inside``, but not in the errors"""
     largest_m: float
     """the error of largest absolute value"""
     mean_m: float
@@ -157,7 +159,9 @@ class Quality:
 def _length_errors(content: dict[str, Any]) -> LengthErrors:
     numbers = {name: _number(content[name]) for name in ("given_m", "largest_m", "mean_m", "std_m", "inside")}
     x, y, z = map(_number, content["volume_m"])
-    return LengthErrors(stick=str(content["stick"]), frames=int(content["frames"]), volume_m=(x, y, z), **numbers)
+    return LengthErrors(
+        stick=str(content["stick"]), frames=int(content["frames"]), wrong=int(content["wrong"]), volume_m=(x, y, z), **numbers
+    )
 
 
 def _number(value: Any) -> float:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from torchstickcal.files import without_nan
+from torchstickcal.quality.finding import Severity
 from torchstickcal.result import Calibration, CameraParameter
 from torchstickcal.show.tables import camera_table, point_name, point_table, stage_table, stick_table, unknown_tables
 
@@ -21,7 +22,9 @@ def table(calibration: Calibration, verbose: bool = True) -> str:
         tables += [stick for stick in (stick_table(calibration),) if stick is not None]
         tables += [point_table(calibration), stage_table(calibration)]
     text = [f"{one.title}\n{one.text()}" if number else one.text() for number, one in enumerate(tables)]
-    text += ["\n".join(f"warning: {warning}" for warning in calibration.warnings)] if calibration.warnings else []
+    if verbose:
+        notes = [finding for finding in calibration.quality.findings if finding.severity == Severity.NOTE]
+        text += ["\n".join(f"note: {finding.text}" for finding in notes)] if notes else []
     return "\n\n".join(text)
 
 
@@ -29,6 +32,7 @@ def summary(calibration: Calibration) -> dict[str, Any]:
     """The calibration without its arrays, as JSON can hold it: None where a number is not known."""
     return without_nan(
         {
+            "quality": calibration.quality.as_json(),
             "status": calibration.status,
             "converged": calibration.converged,
             "cameras": [

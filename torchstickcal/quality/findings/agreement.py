@@ -19,7 +19,7 @@ _SAME_VIEW_RAD = 0.005
 """Mean angle between the rays of two cameras to the same points, below which they see one and the same view."""
 _LEAST_PARALLAX_DEG = 3.0
 """Largest mean angle between the rays of two cameras below which depth is hardly known."""
-_IMPRECISE_RIG_SHARE, _LOST_RIG_SHARE = 0.02, 0.1
+_IMPRECISE_RIG_SHARE, _LOST_RIG_SHARE = 0.02, 0.06
 """Standard deviation of a camera's centre as a share of the rig."""
 
 
@@ -104,7 +104,7 @@ def _same_views(evidence: Evidence) -> Iterator[Finding]:
         names = (evidence.camera(first), evidence.camera(second))
         yield Finding(
             "same_view",
-            Severity.SERIOUS if evidence.cameras > 2 else Severity.FATAL,
+            Severity.CAUTION if evidence.cameras > 2 else Severity.FATAL,
             f"{names[0]} and {names[1]} see the scene from the same place, so that the pair has no depth.",
             "Check whether the same video was taken for both.",
             cameras=names,

@@ -5,8 +5,6 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import replace
 
-import torch
-
 from torchstickcal.geometry import se3
 from torchstickcal.metrics import rotation_angle
 from torchstickcal.quality.evidence import Evidence
@@ -14,9 +12,11 @@ from torchstickcal.quality.finding import Finding, Severity
 from torchstickcal.quality.registry import findings
 from torchstickcal.quality.trials import Rest, Sight, hypotheses, moved_within, shifted_share, sight_of, tried, without
 
-_SOUND_SHARE, _GAIN = 0.65, 0.15
-"""Share of keypoints that agree in a sound camera, and the least gain of an explanation over none."""
+_SOUND_SHARE, _GAIN, _CLEAR_GAIN = 0.6, 0.15, 0.08
+"""Share of keypoints that agree in a sound camera, and the least gain of an explanation over none, where that is wrong and where
+it is nearly right."""
 _MOST_SUSPECTS = 4
+_BEHIND_OTHERS = 0.9
 _SUSPECT_SHARE = 0.8
 _NOISE_RATIO = 0.6
 
@@ -38,19 +38,20 @@ def causes(evidence: Evidence) -> Iterator[Finding]:
     if best is None:
         return
     _, camera, rest = best
-    whole = float(agreement.mean())
-    better = rest.share > whole + 0.05 or rest.noise_mrad < _NOISE_RATIO * evidence.noise_mrad
+    worse = float(agreement[camera]) < _BEHIND_OTHERS * rest.share
+    better = worse or rest.noise_mrad < _NOISE_RATIO * evidence.noise_mrad
     if rest.share < _SOUND_SHARE or not better:
         return
-    yield _explained(evidence, camera, rest)
+    if (finding := _explained(evidence, camera, rest)) is not None:
+        yield finding
 
 
 def _soundness(rest: Rest) -> float:
     return rest.share - 0.02 * rest.noise_mrad
 
 
-def _explained(evidence: Evidence, camera: int, rest: Rest) -> Finding:
-    """What is wrong with the camera without which the others agree."""
+def _explained(evidence: Evidence, camera: int, rest: Rest) -> Finding | None:
+    """What is wrong with the camera without which the others agree; None if nothing is."""
     sight, name = sight_of(evidence, camera), evidence.camera(camera)
     plain = rest.placed(sight)
     as_given = 0.0 if plain is None else plain[0].share
@@ -69,18 +70,19 @@ def _explained(evidence: Evidence, camera: int, rest: Rest) -> Finding:
             is_cause=True,
         )
 
-    if plain is not None and as_given > _SOUND_SHARE:
+    found = [(h, placed[0].share) for h in hypotheses() if (placed := rest.placed(h.changed(sight))) is not None]
+    hypothesis, share = max(found, key=lambda one: one[1], default=(None, 0.0))
+    if hypothesis is not None and share > max(_SOUND_SHARE, as_given + (_GAIN if as_given < _SOUND_SHARE else _CLEAR_GAIN)):
+        return cause(hypothesis.code, hypothesis.what, hypothesis.advice, share)
+    if as_given > _SOUND_SHARE:
+        if as_given < float(evidence.agreement[camera]) + _CLEAR_GAIN:
+            return None
         return cause(
             "camera_misplaced",
             "its keypoints agree with the other cameras at another place than the one that was found",
             "Calibrate the other cameras first, or give a session in which this camera shares more with them.",
             as_given,
         )
-    found = [(h, placed[0].share) for h in hypotheses() if (placed := rest.placed(h.changed(sight))) is not None]
-    if found:
-        hypothesis, share = max(found, key=lambda one: one[1])
-        if share > _SOUND_SHARE and share > as_given + _GAIN:
-            return cause(hypothesis.code, hypothesis.what, hypothesis.advice, share)
     if (moved := moved_within(rest, sight)) is not None:
         return _moved(evidence, camera, *moved)
     later, share = shifted_share(rest, sight, evidence.ended.frames[0].rate_hz)

@@ -15,7 +15,7 @@ _RIVAL_SHARE = 0.7
 """Evidence against another camera, as a share, from which on it is not certain which of both moved."""
 
 
-@findings("motion", "cameras that moved during the session")
+@findings("motion", "cameras that moved during the session", small=True)
 def motion(evidence: Evidence) -> Iterator[Finding]:
     """The camera that moved, when and how far. A lens or a clock that is wrong looks alike, and explains more where it is."""
     found = evidence.motion
@@ -45,5 +45,5 @@ def motion(evidence: Evidence) -> Iterator[Finding]:
         figure=found.evidence**0.5,
         limit=LEAST_EVIDENCE**0.5,
         unit="standard deviations",
-        is_cause=True,
+        is_cause=evidence.consistent,
     )

@@ -14,7 +14,7 @@ from torchstickcal.solvers.elimination.normal_equations import NormalEquations
 _WRONG_LENGTH_SHARE, _WRONG_LENGTH_SIGMAS = 0.02, 4.0
 """Deviation of a stick's length from the given one, as a share of it and in tolerances, beyond which it is not the stick."""
 _FEW_FRAMES = 10
-_IMPRECISE_SCALE, _UNKNOWN_SCALE = 0.01, 0.05
+_IMPRECISE_SCALE, _UNKNOWN_SCALE = 0.01, 0.04
 _WORSE_END = 3.0
 """Noise of one end over that of the other."""
 _INSIDE_SHARE, _LEAST_LENGTHS = 0.7, 20

@@ -16,11 +16,14 @@ _CLEAR_SIGMAS = 8.0
 _OPEN_SHARE = 0.5
 _WRONG_FOCAL = 0.01
 """Error of a focal length from which on the camera's distance is wrong by more than 1 %."""
+_ANOTHER_CAMERA = 0.3
+"""Error of a focal length that no calibration of the same camera makes: an estimate that far away is doubted too."""
+_IN_STEP_FRAMES = 0.15
 _WRONG_FRAMES = 0.5
 """Time offset, in frames, from which on the clocks matter."""
 
 
-@findings("unknowns", "lenses and clocks that the keypoints contradict or do not determine")
+@findings("unknowns", "lenses and clocks that the keypoints contradict or do not determine", small=True)
 def unknowns(evidence: Evidence) -> Iterator[Finding]:
     """Findings about lenses and clocks."""
     for name, unknown in all_unknowns().items():
@@ -33,7 +36,7 @@ def unknowns(evidence: Evidence) -> Iterator[Finding]:
             Severity.SERIOUS,
             "The cameras do not seem to be synchronised: other frames fit together better than those of equal number or time.",
             "Estimate the time offsets (refine 'time_offset').",
-            is_cause=evidence.explains_most("clock"),
+            is_cause=evidence.consistent and evidence.explains_most("clock"),
         )
     for camera, reason in enumerate(evidence.clocks.reasons if evidence.clocks is not None else ()):
         if reason:
@@ -48,8 +51,8 @@ def _in_step(evidence: Evidence) -> bool:
     rate, offset = evidence.ended.frames[0].rate_hz, evidence.unknowns["time_offset"]
     if rate is None or not evidence.consistent:
         return False
-    known = offset.suggested_std * rate < _WRONG_FRAMES / 2
-    return bool((known & ((offset.suggested - offset.given).abs() * rate < _WRONG_FRAMES)).all())
+    frames = (offset.suggested - offset.given).abs() * rate + offset.suggested_std * rate
+    return bool((frames < _IN_STEP_FRAMES).all())
 
 
 def _contradicted(evidence: Evidence, unknown: CameraUnknown, parameter: CameraParameter) -> Iterator[Finding]:
@@ -62,24 +65,26 @@ def _contradicted(evidence: Evidence, unknown: CameraUnknown, parameter: CameraP
     for camera, (value, std, given, prior_std) in enumerate(zip(*first, strict=True)):
         if not abs(value - given) > max(_CONTRADICTED_SIGMAS * std, unknown.noticeable_prior_share * prior_std):
             continue
+        matters = not parameter.refined and _matters(evidence, unknown.name, value - given, given)
+        far = parameter.refined and unknown.name == "focal" and abs(value - given) > _ANOTHER_CAMERA * abs(given)
         name = evidence.camera(camera)
         what = f"{name}: {unknown.label} {_quantity(value, std, unknown.unit)}"
         if parameter.refined:
-            meaning, advice = f"{what} estimated, {_quantity(given, None, unknown.unit)} was given.", ""
+            meaning = f"{what} estimated, {_quantity(given, None, unknown.unit)} was given."
+            advice = "Such intrinsics are those of another camera or resolution: give the right ones." if far else ""
         else:
             meaning = f"{what} suggested by the keypoints, but {_quantity(given, None, unknown.unit)} was given and used."
             advice = f"Check it, or estimate it (refine {next(iter(unknown.variants))!r})."
-        matters = not parameter.refined and _matters(evidence, unknown.name, value - given, given)
         yield Finding(
             f"{unknown.name}_contradicted",
-            Severity.NOTE if parameter.refined else Severity.SERIOUS if matters else Severity.CAUTION,
+            Severity.SERIOUS if matters or far else Severity.NOTE if parameter.refined else Severity.CAUTION,
             meaning,
             advice,
             cameras=(name,),
             figure=(value - given) / std if std > 0 else None,
             limit=_CONTRADICTED_SIGMAS,
             unit="standard deviations",
-            is_cause=matters and evidence.explains_most(unknown.family),
+            is_cause=matters and evidence.consistent and evidence.explains_most(unknown.family),
         )
 
 
@@ -92,7 +97,9 @@ def _different(evidence: Evidence, unknown: CameraUnknown, parameter: CameraPara
     far = (difference > parameter.by_component("prior_std")).any(1)
     for camera in (far & (evidence.contradictions[unknown.name] > _CLEAR_SIGMAS**2)).nonzero().flatten().tolist():
         name = evidence.camera(camera)
-        pairs = zip(parameter.by_component("suggested")[camera].tolist(), parameter.by_component("given")[camera].tolist(), strict=True)
+        pairs = zip(
+            parameter.by_component("suggested")[camera].tolist(), parameter.by_component("given")[camera].tolist(), strict=True
+        )
         values = ", ".join(
             f"{component} {_quantity(value, None, unknown.unit)} instead of {_quantity(given, None, unknown.unit)}"
             for component, (value, given) in zip(unknown.components, pairs, strict=True)
@@ -106,7 +113,7 @@ def _different(evidence: Evidence, unknown: CameraUnknown, parameter: CameraPara
             figure=float(evidence.contradictions[unknown.name][camera].sqrt()),
             limit=_CLEAR_SIGMAS,
             unit="standard deviations",
-            is_cause=evidence.explains_most("lens"),
+            is_cause=evidence.consistent and evidence.explains_most("lens"),
         )
 
 
