@@ -12,6 +12,7 @@ from torchstickcal.cli.check import check_session
 from torchstickcal.cli.evaluate import evaluate
 from torchstickcal.cli.listing import LISTS, list_names
 from torchstickcal.cli.outputs import EXIT_UNUSABLE
+from torchstickcal.cli.report import report
 from torchstickcal.cli.simulate import demo, simulate
 
 
@@ -34,7 +35,7 @@ def parser() -> argparse.ArgumentParser:
         description="Calibrate a camera rig, in metres, from an athlete's keypoints and a stick of known length.",
     )
     commands = parser.add_subparsers(metavar="COMMAND", required=True)
-    for add in (_add_calibrate, _add_check, _add_evaluate, _add_benchmark, _add_simulate, _add_demo, _add_list):
+    for add in (_add_calibrate, _add_report, _add_check, _add_evaluate, _add_benchmark, _add_simulate, _add_demo, _add_list):
         add(commands)
     return parser
 
@@ -72,8 +73,19 @@ def _add_calibrate(commands: Any) -> None:
         "--split-moved", action="store_true", help="if a camera moved, calibrate again with its places before and after as two"
     )
     _add_strict(command)
+    command.add_argument("--verbose", action="store_true", help="show every table: lenses, clocks, sticks, points, stages")
     _add_plugin(command)
     command.set_defaults(run=calibrate_session)
+
+
+def _add_report(commands: Any) -> None:
+    command = commands.add_parser(
+        "report",
+        help="write report.html for results that `calibrate` wrote",
+        description="Write report.html, a page that shows the result, into a folder that `calibrate` wrote.",
+    )
+    command.add_argument("folder", metavar="DIR", type=_path, help="folder that `calibrate` wrote")
+    command.set_defaults(run=report, plugin=())
 
 
 def _add_check(commands: Any) -> None:

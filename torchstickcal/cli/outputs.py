@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 EXIT_DONE, EXIT_NOT_CONVERGED, EXIT_UNUSABLE, EXIT_POOR, EXIT_INTERRUPTED = 0, 1, 2, 3, 130
 CAMERAS_FORMAT = "pose2sim"
-CAMERAS_FILE, POINTS_FILE, REPORT_FILE = "calibration.toml", "points.npz", "report.json"
+CAMERAS_FILE, POINTS_FILE, REPORT_FILE, PAGE_FILE = "calibration.toml", "points.npz", "report.json", "report.html"
 
 
 def chosen_writers(names: str | None) -> dict[str, Writer]:
@@ -33,7 +33,7 @@ def chosen_writers(names: str | None) -> dict[str, Writer]:
     further = names.split(",") if names else []
     for name in dict.fromkeys([CAMERAS_FORMAT, *further]):
         writer = CALIBRATION_WRITERS[name]
-        if writer.file_name in {*writers, POINTS_FILE, REPORT_FILE}:
+        if writer.file_name in {*writers, POINTS_FILE, REPORT_FILE, PAGE_FILE}:
             raise CalibrationError(
                 "two files of one name", where=f"--export {name}", got=writer.file_name, expected="another file name"
             )
@@ -43,25 +43,68 @@ def chosen_writers(names: str | None) -> dict[str, Writer]:
 
 def result_names(writers: dict[str, Writer]) -> list[str]:
     """The names of the files that :func:`write_results` writes."""
-    return [*writers, POINTS_FILE, REPORT_FILE]
+    return [*writers, POINTS_FILE, REPORT_FILE, PAGE_FILE]
 
 
 def write_results(calibration: Calibration, folder: Path, writers: dict[str, Writer], provenance: dict[str, Any]) -> None:
-    """Write the results of a calibration into a folder of :func:`torchstickcal.files.atomic_set`."""
-    from torchstickcal.show.report import summary
+    """Write the results of a calibration into a folder of :func:`torchstickcal.files.atomic_set`.
 
+    Args:
+        calibration: what was found.
+        folder: where.
+        writers: of the camera file and of further formats, by the names of their files.
+        provenance: the session, the configuration and notes, as JSON can hold them.
+    """
+    from torchstickcal.show.page.page import report_page
+
+    made_of = provenance | {"versions": versions()}
     for file_name, writer in writers.items():
         writer.write(folder / file_name, calibration)
     calibration.save(folder / POINTS_FILE)
-    write_json(folder / REPORT_FILE, provenance | summary(calibration))
+    write_json(folder / REPORT_FILE, made_of | calibration.summary())
+    (folder / PAGE_FILE).write_text(report_page(calibration, made_of), "utf-8")
 
 
-def show_results(calibration: Calibration, folder: Path, writers: dict[str, Writer], strict: bool = False) -> int:
+def versions() -> dict[str, str]:
+    """The versions of what calculates."""
+    import platform
+
+    import kornia
+    import numpy as np
+    import torch
+
+    import torchstickcal
+
+    return {
+        "torchstickcal": torchstickcal.__version__,
+        "torch": torch.__version__,
+        "kornia": kornia.__version__,
+        "numpy": np.__version__,
+        "python": platform.python_version(),
+    }
+
+
+def show_results(
+    calibration: Calibration, folder: Path, writers: dict[str, Writer], strict: bool = False, verbose: bool = False
+) -> int:
+    """Show a calibration: the verdict first, then the tables, and where the files are.
+
+    Args:
+        calibration: what was found.
+        folder: where its files are.
+        writers: that wrote them.
+        strict: whether ``usable`` counts as poor.
+        verbose: whether every table is shown.
+
+    Returns:
+        The exit status.
+    """
     from torchstickcal.show.report import table
 
     show_quality(calibration.quality)
-    print(f"\n{table(calibration)}")
+    print(f"\n{table(calibration, verbose)}")
     print(f"\n{', '.join(result_names(writers))} in {folder}")
+    print(f"Open {folder / PAGE_FILE} in a browser to see the result." + ("" if verbose else " More tables: --verbose."))
     if not calibration.converged:
         print(f"not converged: {calibration.status}", file=sys.stderr)
         return EXIT_NOT_CONVERGED

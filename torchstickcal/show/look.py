@@ -1,4 +1,4 @@
-"""One look for all that is shown: the colours of figures, TensorBoard, the report and the terminal, and how numbers are written."""
+"""One look for all that is shown: the colours of figures, TensorBoard, report and terminal, and how numbers are written."""
 
 from __future__ import annotations
 
@@ -33,8 +33,8 @@ COLOURS = {
     "poor": Colour("#c2410c", "#ff8b5c"),
     "failed": Colour("#b3261e", "#ff7b72"),
 }
-"""What has a colour of its own, by its name: the athlete, the stick, keypoints that were used, set aside or relabelled, projections
-of points, and the verdicts."""
+"""What has a colour of its own, by its name: the athlete, the stick, keypoints that were used, set aside or relabelled,
+projections of points, and the verdicts."""
 CAMERA_COLOURS = (
     Colour("#1f77b4", "#5aaeea"), Colour("#c85a00", "#ff9c4a"), Colour("#2a8a3c", "#63c774"), Colour("#8a5cc0", "#bb97ea"),
     Colour("#8c564b", "#c99186"), Colour("#c04e9b", "#f090cc"), Colour("#5f6670", "#a9b1bb"), Colour("#7f8000", "#c5c64a"),

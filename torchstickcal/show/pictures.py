@@ -119,9 +119,7 @@ def _draw_keypoints(axes: Axes, keypoints: Tensor, reprojections: Tensor, inlier
     found, used = reprojections.numpy(), inliers.numpy()
     given = keypoints.numpy()
     pairs = np.stack([given, found], axis=1)
-    axes.add_collection(
-        LineCollection(list(pairs[np.isfinite(pairs).all((1, 2))]), colors=_REPROJECTION, linewidths=0.8)
-    )
+    axes.add_collection(LineCollection(list(pairs[np.isfinite(pairs).all((1, 2))]), colors=_REPROJECTION, linewidths=0.8))
     axes.scatter(*given[used].T, s=12, color=_USED, linewidths=0, label="keypoint, used")
     axes.scatter(*given[~used].T, s=18, color=_ASIDE, marker="x", linewidths=1, label="keypoint, set aside")
     axes.scatter(*found.T, s=22, facecolors="none", edgecolors=_REPROJECTION, linewidths=0.9, label="reprojection")

@@ -24,8 +24,8 @@ _CHAINS = (
     ("left_shoulder", "right_shoulder"),
     ("left_hip", "right_hip"),
 )
-"""Points that follow each other along the body. A point that a detector lacks is passed over; of several names with a bar between
-them the first known one is taken."""
+"""Points that follow each other along the body. A point that a detector lacks is passed over; of several names with a bar
+between them the first known one is taken."""
 
 
 def bones_of(names: Sequence[str] | None) -> list[tuple[int, int]]:
@@ -38,6 +38,10 @@ def bones_of(names: Sequence[str] | None) -> list[tuple[int, int]]:
     index = {name: number for number, name in enumerate(names or ())}
     bones: dict[tuple[int, int], None] = {}
     for chain in _CHAINS:
-        known = [next(index[name] for name in place.split("|") if name in index) for place in chain if index.keys() & {*place.split("|")}]
+        known = [
+            next(index[name] for name in place.split("|") if name in index)
+            for place in chain
+            if index.keys() & {*place.split("|")}
+        ]
         bones |= dict.fromkeys(itertools.pairwise(known))
     return list(bones)

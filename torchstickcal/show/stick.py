@@ -32,7 +32,14 @@ def stick_figure(calibration: Calibration) -> Figure:
         axes.plot(places[known], errors_mm[known], ".", markersize=3, color=COLOURS["stick"].light, label="reconstructed")
         limit = 1.25 * max(float(np.quantile(np.abs(errors_mm[known]), _SPREAD)) if known.any() else 1.0, tolerance_mm, 0.01)
         missing = places[~known]
-        axes.plot(missing, np.full(len(missing), -limit), "|", color=COLOURS["aside"].light, label="an end is not known", clip_on=False)
+        axes.plot(
+            missing,
+            np.full(len(missing), -limit),
+            "|",
+            color=COLOURS["aside"].light,
+            label="an end is not known",
+            clip_on=False,
+        )
         axes.set(ylim=(-limit, limit), ylabel="length - given (mm)", xlabel="frame" if times is None else "time (s)")
         axes.set_title(f"{printable(stick_name(calibration, number))}, {stick.length_m:g} m", fontsize=9, parse_math=False)
         axes.legend(fontsize=7, loc="upper right", ncols=3)

@@ -59,10 +59,11 @@ class Table:
         """The table as HTML, every text escaped."""
         heads = "".join(_head(column) for column in self.columns)
         rows = "".join(
-            f"<tr>{''.join(_cell(cell, column) for cell, column in zip(row, self.columns, strict=True))}</tr>" for row in self.rows
+            f"<tr>{''.join(_cell(cell, column) for cell, column in zip(row, self.columns, strict=True))}</tr>"
+            for row in self.rows
         )
         return (
-            f'<div class="wide"><table><caption>{escape(self.title)}</caption>'
+            f'<h3>{escape(self.title)}</h3><div class="wide"><table>'
             f"<thead><tr>{heads}</tr></thead><tbody>{rows}</tbody></table></div>"
         )
 
@@ -145,8 +146,7 @@ def camera_table(calibration: Calibration) -> Table:
 
 
 def unknown_tables(calibration: Calibration, only_refined: bool = False) -> list[Table]:
-    """For everything that may be unknown of the cameras beside their poses: what was given, what was used, and what the keypoints
-    suggest."""
+    """For everything that may be unknown of the cameras beside their poses: what was given, used and suggested."""
     tables = []
     for name, parameter in calibration.unknowns.items():
         known = bool(parameter.by_component("suggested").isfinite().any())
@@ -174,7 +174,9 @@ def _unknown_table(calibration: Calibration, parameter: CameraParameter) -> Tabl
 
     def of(camera: int, number: int, name: str, std: str | None) -> str:
         value = float(parameter.by_component(name)[camera, number])
-        return with_std(factor * value, float("nan") if std is None else factor * float(parameter.by_component(std)[camera, number]))
+        return with_std(
+            factor * value, float("nan") if std is None else factor * float(parameter.by_component(std)[camera, number])
+        )
 
     pairs = (("given", None), ("value", "std"), ("suggested", "suggested_std"))
     rows = tuple(

@@ -6,7 +6,6 @@ import base64
 from typing import Any
 
 import numpy as np
-import torch
 from torch import Tensor
 
 UNKNOWN = -32768
@@ -25,6 +24,7 @@ def packed(values: Tensor, largest: float | None = None) -> dict[str, Any]:
         ``factor`` and ``int16``, the base64 of the integers in little-endian order.
 
     Example:
+        >>> import torch
         >>> packed(torch.tensor([1.0, float("nan")]))
         {'factor': 3.125e-05, 'int16': 'AH0AgA=='}
     """
@@ -55,6 +55,7 @@ def packed_codes(values: Tensor) -> str:
     """Numbers from 0 to 3, four in a byte, the first in the lowest bits.
 
     Example:
+        >>> import torch
         >>> packed_codes(torch.tensor([1, 2, 3]))
         'OQ=='
     """

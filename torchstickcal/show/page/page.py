@@ -10,6 +10,7 @@ from collections.abc import Iterable, Mapping
 from functools import cache
 from html import escape
 from importlib.resources import files
+from pathlib import PurePath
 from typing import Any
 
 from torchstickcal.files import without_nan
@@ -63,7 +64,7 @@ def report_page(calibration: Calibration, provenance: Mapping[str, Any] | None =
     """
     made_of = dict(provenance or {})
     data = drawn(calibration)
-    title = printable(str(made_of.get("session", "Calibration")))
+    title = _title(str(made_of.get("session", "")))
     script = "(() => {\n'use strict';\n" + "".join(map(_asset, _SCRIPTS)) + "})();\n"
     seal = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
     policy = f"default-src 'none'; script-src 'sha256-{seal}'; style-src 'unsafe-inline'; img-src data:; base-uri 'none'"
@@ -91,9 +92,16 @@ def report_page(calibration: Calibration, provenance: Mapping[str, Any] | None =
     )
 
 
+def _title(session: str) -> str:
+    """The names of the session's files, without their folders."""
+    names = [PurePath(path).name for path in session.split(", ")]
+    more = f" and {len(names) - 2} more" if len(names) > 3 else ""
+    return printable(", ".join(names[:2] if more else names) + more) or "Calibration"
+
+
 @cache
 def _asset(name: str) -> str:
-    return files(__package__).joinpath(name).read_text("utf-8")
+    return files("torchstickcal.show.page").joinpath(name).read_text("utf-8")
 
 
 def _colours() -> str:
@@ -130,7 +138,9 @@ def _quality(quality: Quality) -> str:
     matters = [one for one in quality.findings if one.severity > Severity.NOTE]
     notes = [one for one in quality.findings if one.severity == Severity.NOTE]
     text = "<section><h2>Findings</h2>"
-    text += f"<ul class='findings'>{''.join(map(_finding, matters))}</ul>" if matters else "<p>Nothing that needs attention.</p>"
+    text += (
+        f"<ul class='findings'>{''.join(map(_finding, matters))}</ul>" if matters else "<p>Nothing that needs attention.</p>"
+    )
     if notes:
         text += f"<details{'' if matters else ' open'}><summary>{len(notes)} {'note' if len(notes) == 1 else 'notes'}</summary>"
         text += f"<ul class='findings'>{''.join(map(_finding, notes))}</ul></details>"
@@ -161,12 +171,21 @@ def _acceptance(acceptance: Acceptance) -> str:
             Column("in their 95 % interval", "", "share of the lengths inside their own stated interval; about 95 % is right"),
             Column("volume", "m", "extent of the space in which the stick was"),
         )
-        text += Table("Lengths predicted by cameras that did not see them (VDI/VDE 2634)", columns, tuple(map(_lengths, acceptance.lengths))).html()
+        text += Table(
+            "Lengths predicted by cameras that did not see them (VDI/VDE 2634)",
+            columns,
+            tuple(map(_lengths, acceptance.lengths)),
+        ).html()
     known = [px for px in acceptance.left_out_px if math.isfinite(px)]
-    left_out = f" Each camera's keypoints lie {digits(min(known))} to {digits(max(known))} px (rms) from what the others predict." if known else ""
+    left_out = (
+        f" Each camera's keypoints lie {digits(min(known))} to {digits(max(known))} px (rms) from what the others predict."
+        if known
+        else ""
+    )
     text += (
-        f"<p>Projections lie {digits(acceptance.reprojection_px)} px (rms), {digits(acceptance.reprojection_mrad)} mrad, from their "
-        f"keypoints; rays pass their points at {digits(1000 * acceptance.ray_distance_m)} mm (median).{left_out}</p></section>"
+        f"<p>Projections lie {digits(acceptance.reprojection_px)} px (rms), {digits(acceptance.reprojection_mrad)} mrad, from "
+        f"their keypoints; rays pass their points at {digits(1000 * acceptance.ray_distance_m)} mm (median)."
+        f"{left_out}</p></section>"
     )
     return text
 
@@ -204,7 +223,9 @@ def _tiles(calibration: Calibration) -> str:
 
 def _scene(data: Mapping[str, Any]) -> str:
     """The scene in space. The section stays open: the slider is also that of the images."""
-    views = "".join(f'<option value="{number}">{escape(printable(one["name"]))}</option>' for number, one in enumerate(data["cameras"]))
+    views = "".join(
+        f'<option value="{number}">{escape(printable(one["name"]))}</option>' for number, one in enumerate(data["cameras"])
+    )
     far = data["scene"]["far"]
     left_out = f" {far} points lie far outside the scene and are not drawn." if far else ""
     thinned = f" Of {data['count']} frames every {_ordinal(data['step'])} is shown." if data["step"] > 1 else ""
@@ -218,12 +239,22 @@ def _scene(data: Mapping[str, Any]) -> str:
         "<label><input type='checkbox' id='show-names' checked> names</label>"
         "<label><input type='checkbox' id='show-path' checked> path of the stick</label>"
         "<label><input type='checkbox' id='show-ellipsoids' checked> uncertainty <span id='magnified'></span></label></div>"
-        '<p class="legend"><span class="line stick"></span>stick <span class="line body"></span>athlete '
-        '<span class="ring aside"></span>a keypoint was set aside <span class="ring relabelled"></span>a label was corrected '
-        '<span class="fill used"></span>ellipsoid that holds 95 %, magnified</p>'
-        f"<p class='small'>Metres, in the axes of the calibration. Drag to turn, with two fingers to zoom and tilt.{thinned}{left_out}</p>"
-        "</section>"
+        + _legend(
+            ("line stick", "stick"),
+            ("line body", "athlete"),
+            ("ring aside", "a keypoint was set aside"),
+            ("ring relabelled", "a label was corrected"),
+            ("fill used", "ellipsoid that holds 95 %, magnified"),
+        )
+        + "<p class='small'>Metres, in the axes of the calibration. Drag to turn, with two fingers to zoom and tilt."
+        f"{thinned}{left_out}</p></section>"
     )
+
+
+def _legend(*keys: tuple[str, str]) -> str:
+    """What signs mean: their classes of style, and words."""
+    entries = "".join(f"<span><i class='{kind}'></i>{text}</span>" for kind, text in keys)
+    return f'<p class="legend">{entries}</p>'
 
 
 def _ordinal(number: int) -> str:
@@ -239,14 +270,20 @@ def _cameras(calibration: Calibration, data: Mapping[str, Any]) -> str:
     )
     cards = "".join(_card(calibration, data, camera) for camera in range(len(calibration.camera_names)))
     return (
-        f'<section id="cameras"><h2>Cameras</h2><div class="controls segmented" role="group" aria-label="Images show">{modes}</div>'
-        '<p class="legend"><span class="dot used"></span>keypoint, used <span class="cross aside">&times;</span>set aside '
-        '<span class="ring relabelled"></span>relabelled <span class="ring reprojection"></span>projection of the point '
-        '<span class="fill used"></span>where keypoints were used</p>'
-        f"<p class='small'>Right of each image: the residuals, projection minus keypoint, along x and y.{thinned}</p>"
+        f'<section id="cameras"><h2>Cameras</h2><div class="controls segmented" role="group" aria-label="Images show">{modes}'
+        "<label><input type='checkbox' id='enlarge'> enlarge the part with keypoints</label></div>"
+        + _legend(
+            ("dot used", "keypoint, used"),
+            ("cross aside", "set aside"),
+            ("ring relabelled", "relabelled"),
+            ("ring reprojection", "projection of the point"),
+            ("fill used", "where keypoints were used"),
+        )
+        + f"<p class='small'>Right of each image: the residuals, projection minus keypoint, along x and y.{thinned}</p>"
         f'<div class="cards">{cards}</div></section>'
         '<div class="transport"><button id="play" type="button" aria-label="play">&#9654;</button>'
-        f'<input id="frame" type="range" min="0" max="0" value="0" step="1" aria-label="frame"><output id="when"></output></div>'
+        '<input id="frame" type="range" min="0" max="0" value="0" step="1" aria-label="frame">'
+        '<output id="when"></output></div>'
     )
 
 
@@ -273,7 +310,8 @@ def _card(calibration: Calibration, data: Mapping[str, Any], camera: int) -> str
         f'<article class="card" style="{colour}"><h3>{escape(printable(name))} {_tags(calibration, name)}</h3>'
         f'<div class="pictures"><canvas class="image" data-camera="{camera}" role="img" aria-label="image plane" '
         f'style="aspect-ratio:{image["width"]:.0f}/{image["height"]:.0f}"></canvas>'
-        f'<canvas class="cloud" data-camera="{camera}" role="img" aria-label="residuals"></canvas></div><dl>{rows}</dl></article>'
+        f'<canvas class="cloud" data-camera="{camera}" role="img" aria-label="residuals"></canvas></div>'
+        f"<dl>{rows}</dl></article>"
     )
 
 
@@ -311,24 +349,32 @@ def _curves(calibration: Calibration, data: Mapping[str, Any]) -> str:
     size = data["time"]["size"]
     thinned = f"<p class='small'>One place of a curve stands for {size} frames.</p>" if size > 1 else ""
     sticks = "".join(
-        f'<figure><figcaption>Length of the stick {escape(printable(stick["name"]))}, {digits(stick["given_m"], 4)} m, minus the given '
-        f"one{_left_out(stick)}</figcaption><div class='chart' data-chart='stick' data-number='{number}'></div></figure>"
+        _figure(
+            f"Length of the stick {stick['name']}, {digits(stick['given_m'], 4)} m, minus the given one{_left_out(stick)}",
+            f"data-chart='stick' data-number='{number}'",
+        )
         for number, stick in enumerate(data["time"]["sticks"])
+    )
+    over_time = (
+        ("residual", "Residuals of each camera, median of a frame"),
+        ("used", "Share of the keypoints that was used, of those seen"),
+        ("visibility", "Visibility: how many cameras used each point"),
+    )
+    course = (
+        ("cost", "How far the cost is above its last value, in each stage"),
+        ("reprojection", "Reprojection error of each camera, weighted rms (px)"),
     )
     return (
         f'<section id="curves"><h2>Over time</h2>{thinned}{sticks}'
-        "<figure><figcaption>Residuals of each camera, median of a frame</figcaption>"
-        "<div class='chart' data-chart='residual'></div></figure>"
-        "<figure><figcaption>Share of the keypoints that was used, of those seen</figcaption>"
-        "<div class='chart' data-chart='used'></div></figure>"
-        "<figure><figcaption>Visibility: how many cameras used each point</figcaption>"
-        "<div class='chart' data-chart='visibility'></div></figure></section>"
-        '<section id="convergence"><h2>Convergence</h2><p>'
-        f"{escape(calibration.status)}</p><div class='pair'>"
-        "<figure><figcaption>Cost, over its last value in each stage</figcaption><div class='chart' data-chart='cost'></div></figure>"
-        "<figure><figcaption>Reprojection error of each camera, weighted rms (px)</figcaption>"
-        "<div class='chart' data-chart='reprojection'></div></figure></div></section>"
+        f"{''.join(_figure(text, f'data-chart={name}') for name, text in over_time)}</section>"
+        f'<section id="convergence"><h2>Convergence</h2><p>{escape(calibration.status)}</p><div class="pair">'
+        f"{''.join(_figure(text, f'data-chart={name}') for name, text in course)}</div></section>"
     )
+
+
+def _figure(caption: str, attributes: str) -> str:
+    """The place of a chart that the script draws."""
+    return f'<figure><figcaption>{escape(printable(caption))}</figcaption><div class="chart" {attributes}></div></figure>'
 
 
 def _left_out(stick: Mapping[str, Any]) -> str:
@@ -350,8 +396,14 @@ def _tables(calibration: Calibration) -> str:
 
 def _made_of(provenance: Mapping[str, Any]) -> str:
     """The session, the configuration and the versions."""
-    rows = "".join(f"<div><dt>{escape(printable(str(name)))}</dt><dd>{_value(value)}</dd></div>" for name, value in provenance.items())
-    return f'<section id="made-of"><h2>Made of</h2><dl class="facts">{rows}</dl></section>' if rows else '<section id="made-of"></section>'
+    rows = "".join(
+        f"<div><dt>{escape(printable(str(name)))}</dt><dd>{_value(value)}</dd></div>" for name, value in provenance.items()
+    )
+    return (
+        f'<section id="made-of"><h2>Made of</h2><dl class="facts">{rows}</dl></section>'
+        if rows
+        else '<section id="made-of"></section>'
+    )
 
 
 def _value(value: Any) -> str:
