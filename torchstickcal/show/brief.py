@@ -8,7 +8,7 @@ from torchstickcal.quality.finding import Severity
 from torchstickcal.result import Calibration
 from torchstickcal.show.look import COLOURS
 from torchstickcal.show.quality import meaning_of
-from torchstickcal.show.tables import camera_table, printable
+from torchstickcal.show.tables import camera_facts, camera_table, printable
 
 
 def brief_text(calibration: Calibration) -> str:
@@ -28,5 +28,5 @@ def brief_html(calibration: Calibration) -> str:
     sentence = f"<p>{escape(quality.acceptance.sentence)}</p>" if quality.acceptance is not None else ""
     return (
         f'<div><p><b style="color:{colour}">{quality.verdict}</b>: {escape(meaning_of(quality.verdict))}</p>'
-        f"{f'<ul>{findings}</ul>' if findings else ''}{sentence}{camera_table(calibration).html()}</div>"
+        f"{f'<ul>{findings}</ul>' if findings else ''}{sentence}{camera_table(camera_facts(calibration)).html()}</div>"
     )

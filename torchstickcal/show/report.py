@@ -7,7 +7,15 @@ from typing import Any
 from torchstickcal.files import without_nan
 from torchstickcal.quality.finding import Severity
 from torchstickcal.result import Calibration, CameraParameter
-from torchstickcal.show.tables import camera_table, point_name, point_table, stage_table, stick_table, unknown_tables
+from torchstickcal.show.tables import (
+    camera_facts,
+    camera_table,
+    point_name,
+    point_table,
+    stage_table,
+    stick_table,
+    unknown_tables,
+)
 
 
 def table(calibration: Calibration, verbose: bool = True) -> str:
@@ -17,7 +25,7 @@ def table(calibration: Calibration, verbose: bool = True) -> str:
         calibration: what was found.
         verbose: whether also what was only checked of the cameras, sticks, points and stages are shown.
     """
-    tables = [camera_table(calibration), *unknown_tables(calibration, only_refined=not verbose)]
+    tables = [camera_table(camera_facts(calibration)), *unknown_tables(calibration, only_refined=not verbose)]
     if verbose:
         tables += [stick for stick in (stick_table(calibration),) if stick is not None]
         tables += [point_table(calibration), stage_table(calibration)]

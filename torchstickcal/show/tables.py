@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from html import escape
+from typing import NamedTuple
 
 from torch import Tensor
 
@@ -107,7 +108,36 @@ def keypoints_seen(calibration: Calibration) -> Tensor:
     return calibration.residuals_px.isfinite().all(-1) | calibration.inliers
 
 
-def camera_table(calibration: Calibration) -> Table:
+class CameraFacts(NamedTuple):
+    """What tables and pages say of one camera."""
+
+    name: str
+    centre_m: list[float]
+    std_m: float
+    std_deg: float
+    median_px: float
+    rms_px: float
+    used: int
+    """number of its keypoints that were used"""
+    seen: int
+    """number of its keypoints whose point is known"""
+
+
+def camera_facts(calibration: Calibration) -> list[CameraFacts]:
+    """The facts of each camera."""
+    columns = (
+        calibration.camera_centres,
+        calibration.camera_std_m,
+        calibration.camera_std_deg,
+        calibration.reprojection_median_px,
+        calibration.reprojection_rms_px,
+        calibration.inliers.flatten(1).sum(1),
+        keypoints_seen(calibration).flatten(1).sum(1),
+    )
+    return [CameraFacts(*row) for row in zip(calibration.camera_names, *(column.tolist() for column in columns), strict=True)]
+
+
+def camera_table(cameras: Sequence[CameraFacts]) -> Table:
     """Where the cameras are, how surely, and how well their keypoints fit."""
     columns = (
         Column("camera", is_text=True),
@@ -118,29 +148,17 @@ def camera_table(calibration: Calibration) -> Table:
         Column("keypoints used", "", "keypoints that agree with the other cameras"),
         Column("of those seen", "", "the rest contradicts the other cameras and was set aside"),
     )
-    used = calibration.inliers.flatten(1).sum(1).tolist()
-    seen = keypoints_seen(calibration).flatten(1).sum(1).tolist()
-    values = zip(
-        calibration.camera_names,
-        calibration.camera_centres.tolist(),
-        calibration.camera_std_m.tolist(),
-        calibration.camera_std_deg.tolist(),
-        calibration.reprojection_median_px.tolist(),
-        used,
-        seen,
-        strict=True,
-    )
     rows = tuple(
         (
-            name,
-            " ".join(f"{value:8.4f}" for value in centre),
-            f"{1000 * std_m:.2f}",
-            f"{std_deg:.4f}",
-            f"{px:.3f}",
-            str(taken),
-            share(taken / given) if given else "-",
+            camera.name,
+            " ".join(f"{value:8.4f}" for value in camera.centre_m),
+            f"{1000 * camera.std_m:.2f}",
+            f"{camera.std_deg:.4f}",
+            f"{camera.median_px:.3f}",
+            str(camera.used),
+            share(camera.used / camera.seen) if camera.seen else "-",
         )
-        for name, centre, std_m, std_deg, px, taken, given in values
+        for camera in cameras
     )
     return Table("Cameras", columns, rows)
 

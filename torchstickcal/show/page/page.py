@@ -6,7 +6,8 @@ import base64
 import hashlib
 import json
 import math
-from collections.abc import Iterable, Mapping
+import statistics
+from collections.abc import Iterable, Mapping, Sequence
 from functools import cache
 from html import escape
 from importlib.resources import files
@@ -21,10 +22,11 @@ from torchstickcal.show.look import CAMERA_COLOURS, COLOURS, digits, share, with
 from torchstickcal.show.page.drawn import drawn
 from torchstickcal.show.quality import meaning_of
 from torchstickcal.show.tables import (
+    CameraFacts,
     Column,
     Table,
+    camera_facts,
     camera_table,
-    keypoints_seen,
     point_table,
     printable,
     stage_table,
@@ -63,7 +65,7 @@ def report_page(calibration: Calibration, provenance: Mapping[str, Any] | None =
         (True, False)
     """
     made_of = dict(provenance or {})
-    data = drawn(calibration)
+    data, cameras = drawn(calibration), camera_facts(calibration)
     title = _title(str(made_of.get("session", "")))
     script = "(() => {\n'use strict';\n" + "".join(map(_asset, _SCRIPTS)) + "})();\n"
     seal = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
@@ -73,12 +75,12 @@ def report_page(calibration: Calibration, provenance: Mapping[str, Any] | None =
         [
             _head(calibration, title),
             _quality(calibration.quality),
-            _tiles(calibration),
+            _tiles(calibration, cameras),
             _scene(data),
-            _cameras(calibration, data),
+            _cameras(calibration, data, cameras),
             "</div>",
             _curves(calibration, data),
-            _tables(calibration),
+            _tables(calibration, cameras),
             _made_of(made_of),
         ]
     )
@@ -165,6 +167,7 @@ def _acceptance(acceptance: Acceptance) -> str:
             Column("stick, predicted", is_text=True),
             Column("given", "m"),
             Column("frames", "", "frames whose keypoints took no part in the calibration that measures them"),
+            Column("left out", "", "lengths that are wrong by more than 6 of their standard deviations: not in the errors"),
             Column("largest error", "mm"),
             Column("mean error", "mm"),
             Column("std", "mm", "standard deviation of the measured lengths"),
@@ -195,6 +198,7 @@ def _lengths(one: LengthErrors) -> tuple[str, ...]:
         one.stick,
         f"{one.given_m:.4f}",
         str(one.frames),
+        str(one.wrong),
         f"{1000 * one.largest_m:+.2f}",
         f"{1000 * one.mean_m:+.2f}",
         f"{1000 * one.std_m:.2f}",
@@ -203,9 +207,9 @@ def _lengths(one: LengthErrors) -> tuple[str, ...]:
     )
 
 
-def _tiles(calibration: Calibration) -> str:
+def _tiles(calibration: Calibration, facts: Sequence[CameraFacts]) -> str:
     cameras, frames, points = calibration.inliers.shape
-    seen, used = int(keypoints_seen(calibration).sum()), int(calibration.inliers.sum())
+    seen, used = sum(camera.seen for camera in facts), sum(camera.used for camera in facts)
     relabelled = int((calibration.relabelled & calibration.inliers).sum())
     tiles = [
         ("cameras", str(cameras)),
@@ -214,11 +218,16 @@ def _tiles(calibration: Calibration) -> str:
         ("keypoints used", share(used / seen) if seen else "-"),
         ("keypoints set aside", str(seen - used)),
         ("relabelled", str(relabelled)),
-        ("reprojection, median", f"{digits(float(calibration.reprojection_median_px.nanmedian()))} px"),
+        ("reprojection, median", f"{digits(_median([camera.median_px for camera in facts]))} px"),
         ("std of the scale", f"{digits(100 * float(calibration.scale_std), 2)} %"),
-        ("largest std of a position", f"{digits(1000 * float(calibration.camera_std_m.max()))} mm"),
+        ("largest std of a position", f"{digits(1000 * max(camera.std_m for camera in facts))} mm"),
     ]
     return f'<dl class="tiles">{"".join(f"<div><dt>{name}</dt><dd>{value}</dd></div>" for name, value in tiles)}</dl>'
+
+
+def _median(values: Sequence[float]) -> float:
+    known = [value for value in values if math.isfinite(value)]
+    return statistics.median(known) if known else math.nan
 
 
 def _scene(data: Mapping[str, Any]) -> str:
@@ -261,14 +270,14 @@ def _ordinal(number: int) -> str:
     return f"{number}{'th' if 10 <= number % 100 <= 20 else {1: 'st', 2: 'nd', 3: 'rd'}.get(number % 10, 'th')}"
 
 
-def _cameras(calibration: Calibration, data: Mapping[str, Any]) -> str:
+def _cameras(calibration: Calibration, data: Mapping[str, Any], facts: Sequence[CameraFacts]) -> str:
     every = data["step"] * data["images"]["every"]
     thinned = f" Images: every {_ordinal(every)} frame." if every > 1 else ""
     modes = "".join(
         f"<label><input type='radio' name='mode' value='{value}'{' checked' if value == 'frame' else ''}>{text}</label>"
         for value, text in (("frame", "this frame"), ("residuals", "mean residuals"))
     )
-    cards = "".join(_card(calibration, data, camera) for camera in range(len(calibration.camera_names)))
+    cards = "".join(_card(calibration, data, camera, own) for camera, own in enumerate(facts))
     return (
         f'<section id="cameras"><h2>Cameras</h2><div class="controls segmented" role="group" aria-label="Images show">{modes}'
         "<label><input type='checkbox' id='enlarge'> enlarge the part with keypoints</label></div>"
@@ -287,18 +296,15 @@ def _cameras(calibration: Calibration, data: Mapping[str, Any]) -> str:
     )
 
 
-def _card(calibration: Calibration, data: Mapping[str, Any], camera: int) -> str:
+def _card(calibration: Calibration, data: Mapping[str, Any], camera: int, own: CameraFacts) -> str:
     """One camera: its image, its residuals, and what is known of it."""
-    name, image = calibration.camera_names[camera], data["cameras"][camera]
-    seen, used = int(keypoints_seen(calibration)[camera].sum()), int(calibration.inliers[camera].sum())
-    std_m, std_deg = float(calibration.camera_std_m[camera]), float(calibration.camera_std_deg[camera])
-    median, rms = float(calibration.reprojection_median_px[camera]), float(calibration.reprojection_rms_px[camera])
-    place = "the world" if camera == 0 and std_m == 0 else f"± {digits(1000 * std_m)} mm, ± {digits(std_deg)} deg"
+    image = data["cameras"][camera]
+    place = f"± {digits(1000 * own.std_m)} mm, ± {digits(own.std_deg)} deg"
     facts = [
-        ("Keypoints used", f"{used} ({share(used / seen) if seen else '-'})"),
+        ("Keypoints used", f"{own.used} ({share(own.used / own.seen) if own.seen else '-'})"),
         ("Image covered", share(image["covered"])),
-        ("Reprojection", f"{digits(median)} px median, {digits(rms)} px rms"),
-        ("Position, rotation", place),
+        ("Reprojection", f"{digits(own.median_px)} px median, {digits(own.rms_px)} px rms"),
+        ("Position, rotation", "the world" if camera == 0 and own.std_m == 0 else place),
         *_checks(calibration, camera),
     ]
     other = int(calibration.other_person[camera].sum())
@@ -307,7 +313,7 @@ def _card(calibration: Calibration, data: Mapping[str, Any], camera: int) -> str
     rows = "".join(f"<div><dt>{title}</dt><dd>{escape(text)}</dd></div>" for title, text in facts)
     colour = f"--camera:var(--c{camera % len(CAMERA_COLOURS)})"
     return (
-        f'<article class="card" style="{colour}"><h3>{escape(printable(name))} {_tags(calibration, name)}</h3>'
+        f'<article class="card" style="{colour}"><h3>{escape(printable(own.name))} {_tags(calibration, own.name)}</h3>'
         f'<div class="pictures"><canvas class="image" data-camera="{camera}" role="img" aria-label="image plane" '
         f'style="aspect-ratio:{image["width"]:.0f}/{image["height"]:.0f}"></canvas>'
         f'<canvas class="cloud" data-camera="{camera}" role="img" aria-label="residuals"></canvas></div>'
@@ -382,10 +388,10 @@ def _left_out(stick: Mapping[str, Any]) -> str:
     return f"; {missing} frames are left out, in which an end is not known" if missing else ""
 
 
-def _tables(calibration: Calibration) -> str:
+def _tables(calibration: Calibration, cameras: Sequence[CameraFacts]) -> str:
     stick = stick_table(calibration)
     tables = [
-        camera_table(calibration),
+        camera_table(cameras),
         *unknown_tables(calibration),
         *([stick] if stick else []),
         point_table(calibration),
