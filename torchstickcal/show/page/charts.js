@@ -1,6 +1,11 @@
 // Curves and maps as SVG, drawn at the width that they have on the page.
 
-const SVG = 'http://www.w3.org/2000/svg';
+/** The namespace of SVG, as the browser knows it. */
+const SVG = (() => {
+  const holder = document.createElement('div');
+  holder.innerHTML = '<svg></svg>';
+  return holder.firstChild.namespaceURI;
+})();
 const places = Math.ceil(data.count / data.time.size);
 const MARGIN = { left: 52, right: 12, top: 8, bottom: 30 };
 

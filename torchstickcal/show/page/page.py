@@ -128,11 +128,14 @@ def _head(calibration: Calibration, title: str) -> str:
 
 
 def _first(calibration: Calibration) -> str:
-    """What to do first: the advice of the first finding that has one and matters."""
-    advice = next((one.advice for one in calibration.quality.findings if one.advice and one.severity > Severity.NOTE), "")
-    advice = advice or ("" if calibration.quality.verdict.acceptable else "Look at the findings below.")
+    """What to do first: the first finding that matters and has advice."""
     status = "" if calibration.converged else f"<p>Not converged: {escape(calibration.status)}.</p>"
-    return status + (f'<p class="first"><b>Do first:</b> {escape(printable(advice))}</p>' if advice else "")
+    findings = (one for one in calibration.quality.findings if one.advice and one.severity > Severity.NOTE)
+    first = next(findings, None)
+    if first is None:
+        return status
+    meaning, advice = escape(printable(first.meaning)), escape(printable(first.advice))
+    return f'{status}<p class="first"><b>Do first:</b> {meaning} <b>{advice}</b></p>'
 
 
 def _quality(quality: Quality) -> str:

@@ -56,11 +56,12 @@ function drawScene(frame) {
   if (!sheet) return;
   const { context, width, height } = sheet;
   const seen = view(width, height);
+  const horizon = fromCamera === null ? 0.43 : 0.5;
   const project = (point) => {
     const from = sum(point, seen.eye, -1);
     const depth = dotted(from, seen.away);
     if (depth < 0.02 * scene.radius) return null;
-    return [width / 2 + (seen.focal * dotted(from, seen.x)) / depth, height / 2 - (seen.focal * dotted(from, seen.y)) / depth, depth];
+    return [width / 2 + (seen.focal * dotted(from, seen.x)) / depth, horizon * height - (seen.focal * dotted(from, seen.y)) / depth, depth];
   };
   const line = (a, b, ink, thick, strength = 1) => {
     const from = project(a), to = project(b);
