@@ -106,9 +106,13 @@ def browser_page(profile: Path) -> Iterator[Page]:
     os.close(into)
     os.close(out_of)
     try:
-        yield Page(to_browser, from_browser)
+        page = Page(to_browser, from_browser)
+        yield page
+        page.call("Browser.close")
+        process.wait(_PATIENCE_S)
     finally:
-        process.terminate()
-        process.wait()
+        if process.poll() is None:
+            process.kill()
+            process.wait()
         os.close(to_browser)
         os.close(from_browser)

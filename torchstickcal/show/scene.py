@@ -11,8 +11,8 @@ from torch import Tensor
 
 from torchstickcal.result import Calibration
 from torchstickcal.show.look import COLOURS, camera_colour
-from torchstickcal.show.rig import frusta, plot_rotation
 from torchstickcal.show.skeleton import bones_of
+from torchstickcal.show.space import frusta, plot_rotation
 
 _FRUSTUM_EDGES = ((0, 1), (0, 2), (0, 3), (0, 4), (1, 2), (2, 3), (3, 4), (4, 1))
 _EDGE = 0.025

@@ -13,8 +13,8 @@ from torchstickcal.geometry.cameras import Intrinsics
 from torchstickcal.lazy import cached_property
 from torchstickcal.result import Calibration
 from torchstickcal.show.page.packing import packed, packed_codes, packed_floats, packed_roots, packed_shares
-from torchstickcal.show.rig import frusta, plot_rotation
 from torchstickcal.show.skeleton import bones_of
+from torchstickcal.show.space import frusta, plot_rotation
 from torchstickcal.show.tables import keypoints_seen, point_name, stick_name
 from torchstickcal.solvers.uncertainty import centre_covariances, point_covariances
 
@@ -230,7 +230,7 @@ def _image_statistics(drawing: Drawing, camera: int, width: float, height: float
     y = (places[:, 1] / height * rows).floor().long().clamp(0, rows - 1)
     counts = torch.zeros(rows * columns).double().index_add(0, y * columns + x, torch.ones(len(x)).double())
     sums = torch.zeros(rows * columns, 2).double().index_add(0, y * columns + x, sizes)
-    least = 5
+    least = 20
     means = (sums / counts[:, None]).where(counts[:, None] >= least, torch.nan)
     aside = residuals[~used & residuals.isfinite().all(-1)]
     return {

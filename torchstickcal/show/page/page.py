@@ -61,7 +61,7 @@ def report_page(calibration: Calibration, provenance: Mapping[str, Any] | None =
         >>> from torchstickcal.simulate import Noise, golf_session
         >>> calibration = calibrate(golf_session(cameras=3, frames=20, noise=Noise(1.0))[0])
         >>> page = report_page(calibration)
-        >>> page.startswith("<!doctype html>"), "http" in page
+        >>> page.startswith("<!doctype html>"), "://" in page
         (True, False)
     """
     made_of = dict(provenance or {})
