@@ -154,7 +154,7 @@ def test_a_session_that_fails_has_a_status_no_gradient_and_no_influence():
     result = layer(keypoints, OBSERVATIONS.cameras)
     assert result.converged.tolist() == [False, True, False]
     assert "never seen" in result.status[0]
-    assert "cameras see too little in common" in result.status[2]
+    assert "see too little in common" in result.status[2]
     (gradient,) = torch.autograd.grad(readout(result), keypoints)
     assert (gradient[[0, 2]] == 0).all()
     assert gradient[1].nan_to_num().abs().max() > 0

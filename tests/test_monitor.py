@@ -197,6 +197,17 @@ def test_steps_do_not_collide(tmp_path: Path):
     assert sorted(path.name for path in tmp_path.iterdir()) == ["training_001", "training_002"]
 
 
+def test_only_the_first_of_several_processes_writes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    for rank, runs in ((1, []), (0, ["calibration_001", "training_001"])):
+        monkeypatch.setattr("torch.distributed.is_initialized", lambda: True)
+        monkeypatch.setattr("torch.distributed.get_rank", lambda rank=rank: rank)
+        with TensorBoardMonitor(tmp_path, figures=False) as monitor:
+            calibrate(OBSERVATIONS, callback=monitor)
+            layer_calls(monitor, range(1))
+            assert (monitor.writer is None) == bool(rank)
+        assert sorted(path.name for path in tmp_path.iterdir()) == runs
+
+
 @pytest.mark.parametrize(
     "wrong",
     [

@@ -131,6 +131,14 @@ class Adjustment:
         found = self.seen.unknowns.by_name(self.state.unknowns).get("time_offset")
         return torch.zeros_like(self.frames[0].offsets_frames) if found is None else found[0, :, 0]
 
+    @property
+    def deviations(self) -> dict[str, Tensor]:
+        """(C, n), what was found beyond the given values in one session, by the name of the unknown, in units of deviations."""
+        found = {name: own[0] for name, own in self.seen.unknowns.by_name(self.state.unknowns).items()}
+        if "time_offset" in found:
+            found["time_offset"] = found["time_offset"] + self.frames[0].offsets_frames[:, None]
+        return found
+
     def __getitem__(self, session: int) -> Adjustment:
         """One of the sessions that has just begun or ended a stage, without results."""
         one = slice(session, session + 1)
@@ -194,12 +202,12 @@ class WarmStart:
     """(C, 3, 3), world to camera"""
     translations: Tensor
     """(C, 3), metres"""
-    points: Tensor
-    """(F, P, 3), metres, NaN where not known"""
+    points: Tensor | None
+    """(F, P, 3), metres, NaN where not known; None if none is known"""
     unknowns: Tensor
     """(K,), of the cameras"""
-    inliers: Tensor
-    """(C, F, P)"""
+    inliers: Tensor | None
+    """(C, F, P), None for all keypoints"""
     sigma_px: Tensor
     """(P,)"""
 
@@ -245,11 +253,34 @@ def begin(
     if start is not None and config.relabel:
         begun = _relabelled(begun, run)
     if start is not None and seen.unknowns.clocked:
-        known = begun.measurements.keeping(start.inliers.flatten(1)[None])
+        known = begun.measurements
+        if start.inliers is not None:
+            known = known.keeping(start.inliers.flatten(1)[None])
         support = Support.of(known, begun.state, start.sigma_px[None].double())
         begun = replace(begun, measurements=begun.exposures.at_common_times(begun.seen, begun.state, support))
     run.took(_INITIALISE, time.perf_counter() - began)
     return begun
+
+
+def begin_at_nearest_frames(adjustment: Adjustment, run: Run) -> Adjustment:
+    """One session from where it has ended, with the frames that are nearest in time by the time offsets found.
+
+    Raises:
+        ObservationError: if no two cameras have a frame in common at these offsets.
+    """
+    remaining = adjustment.remaining_offsets_frames
+    own = adjustment.seen.unknowns.by_name(adjustment.state.unknowns)
+    own["time_offset"] = torch.zeros_like(own["time_offset"])
+    state = adjustment.state
+    start = WarmStart(
+        state.rotations[0],
+        state.translations[0],
+        points=None,
+        unknowns=adjustment.seen.unknowns.of_cameras(own)[0],
+        inliers=None,
+        sigma_px=adjustment.last.sigma_px[0],
+    )
+    return begin(adjustment.observations[0], run, adjustment.refined, adjustment.frames[0].offsets_frames + remaining, start)
 
 
 def adjust_cameras(adjustment: Adjustment, run: Run, only_last: bool = False) -> Adjustment:
@@ -385,7 +416,9 @@ def _synchronised(adjustment: Adjustment, run: Run) -> Adjustment:
 def _state_of(start: WarmStart, seen: Measurements, config: Config) -> State:
     """An earlier estimate as a state; points that it does not have are triangulated."""
     rotations, translations, unknowns = (v[None].double() for v in (start.rotations, start.translations, start.unknowns))
-    points = start.points.double().flatten(0, 1).mT[None]
+    points = torch.full_like(seen.pixels[:, 0, :1].double().expand(-1, 3, -1), torch.nan)
+    if start.points is not None:
+        points = start.points.double().flatten(0, 1).mT[None]
     known = points.isfinite().all(1)
     points = points.nan_to_num()
     if bool((seen.active & ~known).any()):

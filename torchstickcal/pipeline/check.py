@@ -8,7 +8,7 @@ strongly the keypoints ask for this choice.
 from __future__ import annotations
 
 import itertools
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -21,7 +21,7 @@ from torchstickcal.model.correlation import ErrorCorrelation, error_correlation
 from torchstickcal.model.measurements import Measurements
 from torchstickcal.model.objective import Objective
 from torchstickcal.model.state import State
-from torchstickcal.model.unknowns import RigUnknowns, all_unknowns, with_refinements
+from torchstickcal.model.unknowns import RigUnknowns, all_unknowns, clock_refinements, with_refinements
 from torchstickcal.pipeline.adjust import Adjustment
 from torchstickcal.solvers import Termination, ignore_record
 from torchstickcal.solvers.elimination.normal_equations import NormalEquations
@@ -32,10 +32,16 @@ _CHECKED_FRAMES = 5000
 _SIGMAS = 4.0
 _STEPS = 8
 """Most steps to the least cost with all lenses and clocks unknown."""
-_FRAME_FOLDS, _POINT_FOLDS = 4, 3
+_FRAME_FOLDS, _POINT_FOLDS = 8, 3
 """Parts of the frames and of the points that in turn take no part in finding what is refined, and judge it."""
 _PRICE = 4.0
 """Decrease of the cost that each further unknown has to bring, in units of a squared standard deviation; chance brings 1."""
+_ALIKE = 0.05
+"""Relative difference of the decreases of the cost up to which two choices explain the keypoints equally well."""
+_STRAIGHT_FRAMES = 0.25
+"""Time over which the motion of the keypoints may be taken as straight."""
+_LARGEST_LOSS = 0.1
+"""What a choice may lose in the parts of the frames that it makes fit worse, as a share of what it gains in the others."""
 
 
 class Suggestion(NamedTuple):
@@ -54,6 +60,16 @@ class Fold(NamedTuple):
     gradient: Tensor
 
 
+class Solution(NamedTuple):
+    """What some unknowns would be by the keypoints, everything else being unknown as it is."""
+
+    unknowns: RigUnknowns
+    values: Tensor
+    """(K,)"""
+    covariance: Tensor
+    """(K, K)"""
+
+
 class CameraCheck:
     """One session's cameras at a solution, examined as if their lenses and clocks were unknown.
 
@@ -70,6 +86,7 @@ class CameraCheck:
         cameras = kept.cameras_at(state).to(torch.float64)
         self._cameras, self._groups = cameras, groups
         self._choices: dict[tuple[str, ...], tuple[Tensor, RigUnknowns]] = {}
+        self._solutions: dict[tuple[str, ...], Solution] = {}
         self._variants = {unknown.name: next(iter(unknown.variants)) for unknown in all_unknowns().values()}
         self._every = RigUnknowns.of(tuple(self._variants.values()), cameras, groups)
         sigma_px = result.sigma_px
@@ -96,44 +113,128 @@ class CameraCheck:
     def wanted(
         self, allowed: Collection[str], refined: Sequence[str] = (), failed: Sequence[tuple[str, ...]] = ()
     ) -> tuple[str, ...]:
-        """The refinements that the keypoints ask for most beside those made; none where the cameras agree with the keypoints.
+        """The refinements beside those made that are worth a trial; none where the cameras agree with the keypoints.
+
+        Of the choices that explain the keypoints about equally well, and better than all others, it is the one with the fewest
+        unknowns. A worse explanation is never taken instead: it would be an excuse for what the better one says. The choice
+        has to be needed and to predict (:meth:`confirms`), unless clocks are so far off that this is only seen after a trial.
 
         Args:
             allowed: what may be refined.
             refined: the refinements made.
-            failed: choices that were tried and did not converge.
+            failed: refinements that were tried and rejected; after them only parts of them are tried.
         """
-        best, choice = _SIGMAS**2, ()
+        gains: dict[tuple[str, ...], float] = {}
         for names in _choices():
-            if names in failed or not set(names) <= set(allowed) or with_refinements(refined, names) == tuple(refined):
-                continue
-            gain = self._gain(names)
-            if gain > best and self._predicts(names):
-                best, choice = gain, names
-        return choice
+            added = with_refinements(refined, names)
+            if set(names) <= set(allowed) and added != tuple(refined) and all(set(added) < set(other) for other in failed):
+                gains[names] = self._gain(names)
+        clear, best = _SIGMAS**2, max(gains.values(), default=0.0)
+        least = max(clear, best - max(clear, _ALIKE * best))
+        clocks_as_given = not clock_refinements() & set(refined)
+        alike = [names for names, gain in gains.items() if gain > least]
+        for names in sorted(alike, key=lambda names: (len(self._solved(names).values), -gains[names])):
+            far = clocks_as_given and self._is_far_in_time(names)
+            if far or (self._is_needed(names) and self._predicts(names)):
+                return names
+        return ()
+
+    def confirms(self, names: tuple[str, ...], deviations: Mapping[str, Tensor]) -> bool:
+        """Whether a choice that has been refined here is needed and predicts.
+
+        Needed: its values are far from those given, and so are those of each unknown, beyond chance and the usual errors of
+        calibrations. Predicts: found without some frames or some points, it makes these fit better.
+
+        Args:
+            names: the choice.
+            deviations: (C, n), from the given values, by the name of the unknown.
+        """
+        own = {name: deviation[None] for name, deviation in deviations.items()}
+        values = self._solved(names).unknowns.of_cameras(own)[0]
+        return self._is_needed(names, values) and self._predicts(names, values)
 
     def _gain(self, names: tuple[str, ...]) -> float:
         """Squared length of a choice's values in their standard deviations, less a price for each of its unknowns.
 
         Where the errors of the keypoints are independent, it is the decrease of the cost that the choice promises.
         """
-        unknowns, values, covariance = self._solved(names)
-        return float(values @ solve_information(covariance, values)) - _PRICE * unknowns.count
+        solution = self._solved(names)
+        return _gain(solution.values, solution.covariance)
 
-    def _predicts(self, names: tuple[str, ...]) -> bool:
-        """Whether a choice, found without some frames or without some points, makes these fit better, beyond doubt."""
-        return all(_certain(torch.stack([self._gain_on(fold, names) for fold in folds])) for folds in self._folds if folds)
+    def _is_needed(self, names: tuple[str, ...], values: Tensor | None = None) -> bool:
+        """Whether a choice's values are far from those given, by what the parts of the frames say of their uncertainty.
 
-    def _gain_on(self, fold: Fold, names: tuple[str, ...]) -> Tensor:
-        """Decrease of a fold's cost by a choice that was found without it, beyond that by the poses alone."""
-        information, gradient = self._information - fold.information, self._gradient - fold.gradient
+        That holds for all values together, and for those of each unknown, given the usual errors of calibrations.
 
-        def decrease(names: tuple[str, ...]) -> Tensor:
-            chosen, _ = self._chosen(names)
-            step = -chosen @ solve_information(chosen.mT @ information @ chosen, chosen.mT @ gradient)
+        Args:
+            names: the choice.
+            values: (K,), None for those that the keypoints suggest.
+        """
+        unknowns, suggested, covariance = self._solved(names)
+        covariance, values = self._inflation(names) * covariance, suggested if values is None else values
+        if _gain(values, covariance) <= _SIGMAS**2:
+            return False
+        usual = covariance + unknowns.usual_sigma[0].square().diag()
+        return all(_is_far(values[own], usual[own][:, own]) for own in unknowns.columns.values())
+
+    def _inflation(self, names: tuple[str, ...]) -> float:
+        """How much larger the variances of a choice's values are than those told, by the scatter between parts of the frames.
+
+        Errors that several points or cameras have in common in a frame are alike. That is seen here, not in any point's track.
+        """
+        folds, _ = self._folds
+        if not folds:
+            return 1.0
+        chosen, unknowns = self._chosen(names)
+        without = torch.stack([solve_information(*self._without(fold, chosen)) for fold in folds])[:, -unknowns.count :]
+        jackknife = (len(folds) - 1) * without.var(0, correction=0)
+        return max(1.0, float((jackknife / self._solved(names).covariance.diagonal()).mean()))
+
+    def _is_far_in_time(self, names: tuple[str, ...]) -> bool:
+        """Whether a choice has clocks that are farther off than the motion of the keypoints is straight."""
+        unknowns, values, _ = self._solved(names)
+        clocks = [columns for name, columns in unknowns.columns.items() if all_unknowns()[name].family == "clock"]
+        return any(bool((values[columns].abs() > _STRAIGHT_FRAMES).any()) for columns in clocks)
+
+    def _predicts(self, names: tuple[str, ...], values: Tensor | None = None) -> bool:
+        """Whether a choice, found without some frames or without some points, makes these fit better, beyond doubt.
+
+        Args:
+            names: the choice.
+            values: (K,), at which the cameras are; None for those given.
+        """
+        values = torch.zeros_like(self._solved(names).values) if values is None else values
+        of_frames, of_points = ([self._gain_on(fold, names, values) for fold in folds] for folds in self._folds)
+        if of_frames:
+            gains = torch.stack(of_frames)
+            if float(-gains.clamp_max(0).sum()) > _LARGEST_LOSS * float(gains.clamp_min(0).sum()):
+                return False
+        return all(_certain(torch.stack(gains)) for gains in (of_frames, of_points) if gains)
+
+    def _gain_on(self, fold: Fold, names: tuple[str, ...], values: Tensor) -> Tensor:
+        """Decrease of a fold's cost by a choice that was found without it, beyond that by the poses at the given values.
+
+        Args:
+            fold: the part of the keypoints.
+            names: the choice.
+            values: (K,), at which the cameras are.
+        """
+        chosen, _ = self._chosen(names)
+        poses = len(self._gradient) - self._every.count
+        information, gradient = self._without(fold, chosen)
+        moved = gradient[:poses] - information[:poses, poses:] @ values
+        given = torch.cat([-solve_information(information[:poses, :poses], moved), -values])
+
+        def decrease(step: Tensor) -> Tensor:
+            step = chosen @ step
             return -step @ (2 * fold.gradient + fold.information @ step)
 
-        return decrease(names) - decrease(())
+        return decrease(-solve_information(information, gradient)) - decrease(given)
+
+    def _without(self, fold: Fold, chosen: Tensor) -> tuple[Tensor, Tensor]:
+        """The system of poses and a choice's unknowns of all keypoints but a fold's."""
+        information, gradient = self._information - fold.information, self._gradient - fold.gradient
+        return chosen.mT @ information @ chosen, chosen.mT @ gradient
 
     @cached_property
     def _folds(self) -> tuple[list[Fold], list[Fold]]:
@@ -148,8 +249,10 @@ class CameraCheck:
         of_points = [_fold(m.keeping(kept), self._objective, self._state) for kept in _point_groups(self._objective)]
         return of_frames if len(of_frames) > 1 else [], of_points if len(of_points) > 1 else []
 
-    def _solved(self, names: tuple[str, ...]) -> tuple[RigUnknowns, Tensor, Tensor]:
+    def _solved(self, names: tuple[str, ...]) -> Solution:
         """A choice's unknowns, their values and their covariance."""
+        if names in self._solutions:
+            return self._solutions[names]
         chosen, unknowns = self._chosen(names)
         poses = len(self._gradient) - self._every.count
         information = chosen.mT @ self._information @ chosen
@@ -157,7 +260,8 @@ class CameraCheck:
         covariance = covariance_of(information)
         if self._gradient_covariance is not self._information:
             covariance = covariance @ chosen.mT @ self._gradient_covariance @ chosen @ covariance
-        return unknowns, values, covariance[poses:, poses:]
+        self._solutions[names] = Solution(unknowns, values, covariance[poses:, poses:])
+        return self._solutions[names]
 
     def _chosen(self, names: tuple[str, ...]) -> tuple[Tensor, RigUnknowns]:
         """The map from poses and a choice's unknowns to poses and all unknowns, and the choice's unknowns."""
@@ -213,6 +317,17 @@ def _point_groups(objective: Objective) -> list[Tensor]:
     for number, group in enumerate(groups):
         group[single[number::_POINT_FOLDS]] = True
     return [group.repeat(m.frames) for group in groups]
+
+
+def _gain(values: Tensor, covariance: Tensor) -> float:
+    """Squared length of values (K,) in their standard deviations, less a price for each."""
+    return float(values @ solve_information(covariance, values)) - _PRICE * len(values)
+
+
+def _is_far(values: Tensor, covariance: Tensor) -> bool:
+    """Whether all values (K,) together, or one of them alone, are clearly not zero."""
+    largest = float((values.square() / covariance.diagonal()).max()) - _PRICE
+    return max(largest, _gain(values, covariance)) > _SIGMAS**2
 
 
 def _certain(gains: Tensor) -> bool:

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
+from dataclasses import replace
 
+import torch
 from torch import Tensor
 
 from torchstickcal.errors import ObservationError, RigError
@@ -11,14 +14,28 @@ from torchstickcal.lazy import cached_property
 from torchstickcal.model.measurements import Measurements
 from torchstickcal.model.unknowns import REFINEMENTS, clock_refinements, with_refinements
 from torchstickcal.observations import Observations
-from torchstickcal.pipeline.adjust import Adjustment, adjust_again, adjust_cameras, begin, measured
+from torchstickcal.pipeline.adjust import (
+    Adjustment,
+    adjust_again,
+    adjust_cameras,
+    begin,
+    begin_at_nearest_frames,
+    measured,
+)
 from torchstickcal.pipeline.check import CameraCheck
 from torchstickcal.pipeline.run import Run
 from torchstickcal.pipeline.synchronise import ClockEstimate, on_common_frames, search_offsets, unsynchronised
 
 _MAX_STARTS = 3
-_FAR_FRAMES = 0.75
-"""Remaining time offset, in frames, from which on a camera's frames are chosen anew."""
+_MOST_TRIALS = 3
+"""Adjustments with more refined that ``auto`` tries."""
+_BY_CHANCE = 1.1
+"""Factor by which the median squared residual may grow where nothing has become worse."""
+_FAR_FRAMES = 0.5
+"""Remaining time offset, in frames, from which on a camera's frames are chosen anew. Offsets of nearly a frame are found too
+small, so that the next frames have to be tried before they seem much closer."""
+_CLEARLY_BETTER = 0.5
+"""Median squared residual at other time offsets, relative to that at the given ones, up to which they are tried."""
 _FITTING_SHARE, _FITTING_FOCAL_SHARE = 0.6, 0.01
 """Least fraction of inliers, and largest noise as a fraction of the focal length, of cameras that fit together."""
 
@@ -77,7 +94,7 @@ class ModelSelection:
         failure: RigError | None = None
         if not any(map(_fits, found)):
             try:
-                found.append(self._adjusted_at([name for name in self.named if name not in clock_refinements()]))
+                found.append(self._adjusted_at(self._named_lenses))
             except RigError as error:
                 failure = error
         if clocks is None and "time_offset" in self.allowed and not any(map(_fits, found)):
@@ -89,25 +106,61 @@ class ModelSelection:
         return best if set(self.named) <= set(best.refined) else self._with(best, self.named), clocks
 
     def refined_where_contradicted(self, adjusted: Adjustment, check: CameraCheck) -> tuple[Adjustment, CameraCheck]:
-        """Adjusted with what the keypoints contradict of the cameras, the most contradicted first, and checked again."""
+        """Adjusted with what the keypoints contradict of the cameras, the most contradicted first, and checked again.
+
+        What was found is kept only if it fits better and is still needed there: the check is about the first step, and the
+        adjustment may end elsewhere. Where the given cameras do not converge, nothing more is estimated.
+        """
         failed: list[tuple[str, ...]] = []
-        while choice := check.wanted(self.allowed, adjusted.refined, failed):
+        for _ in range(_MOST_TRIALS if adjusted.converged else 0):
+            choice = check.wanted(self.allowed, adjusted.refined, failed)
+            if not choice:
+                break
             refined = self._with(adjusted, with_refinements(adjusted.refined, choice))
-            if refined.converged:
-                adjusted, check = refined, CameraCheck(refined, self._run.config.camera_groups)
+            refined_check = CameraCheck(refined, self._run.config.camera_groups) if refined.converged else None
+            if (
+                refined_check is not None
+                and _median_squared_residual(refined) <= _BY_CHANCE * _median_squared_residual(adjusted)
+                and refined_check.confirms(choice, refined.deviations)
+            ):
+                adjusted, check = refined, refined_check
             else:
-                failed.append(choice)
+                failed.append(refined.refined)
         return adjusted, check
 
     def _at_offsets(self, clocks: ClockEstimate) -> list[Adjustment]:
-        """Adjusted at the likeliest offsets, and where not all are certain, also at the certain ones alone."""
+        """Adjusted at the likeliest offsets, and where not all are certain, also at the certain ones alone.
+
+        Only those at which the views clearly fit together better than at the given times; a first adjustment says so soon.
+        """
+        candidates = [clocks.likeliest_frames, *([] if all(clocks.determined) else [clocks.offsets_frames])]
+        candidates = [offsets for offsets in candidates if bool(offsets.round().any())]
+        given = self._first_residual(torch.zeros_like(clocks.offsets_frames)) if candidates else 0.0
         found: list[Adjustment] = []
-        for offsets in (clocks.likeliest_frames, *(() if all(clocks.determined) else (clocks.offsets_frames,))):
+        for offsets in candidates:
+            if self._first_residual(offsets.round()) > _CLEARLY_BETTER * given:
+                continue
             try:
                 found.append(self._adjusted_at(with_refinements(self.named, ("time_offset",)), offsets))
             except (RigError, ObservationError):
                 continue
         return found
+
+    def _first_residual(self, offsets_frames: Tensor) -> float:
+        """Median squared residual after the first stage at time offsets (C,), square pixels; infinite where there is no rig."""
+        config = self._run.config
+        first = Run(replace(config, stages=dict(list(config.stages.items())[:1]), relabel=False))
+        try:
+            return _median_squared_residual(
+                adjust_cameras(begin(self._observations, first, self._named_lenses, offsets_frames), first)
+            )
+        except (RigError, ObservationError):
+            return math.inf
+
+    @property
+    def _named_lenses(self) -> list[str]:
+        """What the configuration refines of the lenses."""
+        return [name for name in self.named if name not in clock_refinements()]
 
     def _adjusted_at(self, refined: Sequence[str], offsets_frames: Tensor | None = None) -> Adjustment:
         """Initialised and adjusted at some time offsets (C,) of the cameras, in frames; None for those given."""
@@ -119,13 +172,14 @@ class ModelSelection:
         return self._at_nearest_frames(adjust_again(adjustment, self._run, refined))
 
     def _at_nearest_frames(self, adjustment: Adjustment) -> Adjustment:
-        """Adjusted anew with other frames, where the estimated time offsets say that those are closer in time."""
+        """Adjusted anew with other frames, where the estimated time offsets say that those are closer in time, and they are."""
         for _ in range(_MAX_STARTS - 1):
-            remaining = adjustment.remaining_offsets_frames
-            if not bool((remaining.abs() > _FAR_FRAMES).any()):
+            if not bool((adjustment.remaining_offsets_frames.abs() > _FAR_FRAMES).any()):
                 break
-            offsets = adjustment.frames[0].offsets_frames + remaining
-            adjustment = adjust_cameras(begin(self._observations, self._run, adjustment.refined, offsets), self._run)
+            again = adjust_cameras(begin_at_nearest_frames(adjustment, self._run), self._run, only_last=True)
+            if _median_squared_residual(again) > _BY_CHANCE * _median_squared_residual(adjustment):
+                break
+            adjustment = again
         return adjustment
 
     @property

@@ -113,6 +113,10 @@ class CameraUnknown(ABC):
     """difference from the given value that is worth a warning, as a fraction of the prior's standard deviation; None for no
     warning"""
 
+    usual_prior_share: ClassVar[float] = 0.0
+    """how far values that were calibrated usually are from the truth: the standard deviation, as a fraction of the prior's; 0
+    where there is no usual error. ``auto`` leaves values alone that are not farther from the given ones"""
+
     @abstractmethod
     def prior(self, cameras: Intrinsics) -> Tensor:
         """Standard deviation of the deviations before anything was seen, (..., C, n)."""

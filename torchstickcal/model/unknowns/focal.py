@@ -24,6 +24,7 @@ class Focal(LensUnknown):
     components = ("focal",)
     variants = {"focal": Sharing.OWN, "focal_shared": Sharing.GROUP}
     noticeable_prior_share = 0.05
+    usual_prior_share = 0.07  # a calibration is right to about 0.7 %
 
     def prior(self, cameras: Intrinsics) -> Tensor:
         return torch.full_like(cameras.focal_px, _PRIOR).unsqueeze(-1)

@@ -23,6 +23,7 @@ class PrincipalPoint(LensUnknown):
     unit = "px"
     components = ("centre_x", "centre_y")
     variants = {"principal_point": Sharing.OWN}
+    usual_prior_share = 0.25  # to about 0.5 % of the focal length
 
     def prior(self, cameras: Intrinsics) -> Tensor:
         return (_PRIOR_FOCAL_LENGTHS * cameras.focal_px).unsqueeze(-1).expand(*cameras.focal_px.shape, 2)

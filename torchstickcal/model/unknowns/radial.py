@@ -23,6 +23,7 @@ class Radial(LensUnknown):
     unit = ""
     components = ("k1", "k2")
     variants = {"radial": Sharing.OWN}
+    usual_prior_share = 0.1  # to about 0.03
 
     def prior(self, cameras: Intrinsics) -> Tensor:
         return torch.full_like(cameras.matrix[..., :2, 0], _PRIOR)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -109,13 +109,30 @@ class RigUnknowns:
         own = torch.einsum("ckj,jl,ckl->ck", self.share, covariance, self.share)
         return {unknown.name: part[0] for unknown, part in self._split(own[None])}
 
+    def of_cameras(self, own: Mapping[str, Tensor]) -> Tensor:
+        """Values (B, K) from every camera's own (B, C, n) by the name of the unknown; zero without; means where shared."""
+        sessions, cameras = len(self.prior_sigma), len(self.share)
+        zero = self.share.new_zeros(sessions, cameras, 0)
+        known = [own.get(u.name, zero.new_zeros(sessions, cameras, len(u.components))) for u in self.unknowns]
+        return torch.einsum("ckj,bck->bj", self.share, torch.cat([*known, zero], dim=-1)) / self.share.sum((0, 1))
+
     def taken_over(self, others: RigUnknowns, values: Tensor) -> Tensor:
-        """Values (B, K) from those (B, K') of other unknowns where these have the same; zero elsewhere; means where shared."""
-        known = others.by_name(values)
-        cameras = len(self.share)
-        own = [known.get(u.name, values.new_zeros(len(values), cameras, len(u.components))) for u in self.unknowns]
-        together = torch.cat([*own, values.new_zeros(len(values), cameras, 0)], dim=-1)
-        return torch.einsum("ckj,bck->bj", self.share, together) / self.share.sum((0, 1))
+        """Values (B, K) from those (B, K') of other unknowns, as by :meth:`of_cameras`."""
+        return self.of_cameras(others.by_name(values))
+
+    @property
+    def columns(self) -> dict[str, Tensor]:
+        """Which of the K values belong to each unknown, by its name."""
+        parts = self._split(self.share.sum(0).mT)
+        return {unknown.name: part.any(-1).nonzero().flatten() for unknown, part in parts}
+
+    @property
+    def usual_sigma(self) -> Tensor:
+        """Standard deviations (B, K) of calibrated values around the truth; smaller for means of several cameras."""
+        usual = torch.zeros_like(self.prior_sigma)
+        for unknown in self.unknowns:
+            usual[:, self.columns[unknown.name]] = unknown.usual_prior_share
+        return usual * self.prior_sigma / self.share.sum((0, 1)).sqrt()
 
     def applied(self, cameras: Intrinsics, values: Tensor) -> Intrinsics:
         """The cameras at values (B, K)."""
