@@ -91,12 +91,14 @@ class Kind:
         codes: of the findings that name the cause.
         tellable: whether the keypoints can tell.
         cameras: least number of cameras.
+        elsewhere: whether the camera is not where the session has it, so that its place is not compared.
     """
 
     make: Callable[[SimulatedSession, int, np.random.Generator], Observations]
     codes: tuple[str, ...]
     tellable: bool = True
     cameras: int = 3
+    elsewhere: bool = False
 
 
 def with_camera(observations: Observations, camera: int, keypoints: torch.Tensor) -> Observations:
@@ -242,24 +244,29 @@ KINDS: dict[str, Kind] = {
         lambda s, c, r: without_size(with_camera(s.observations, c, s.observations.keypoints[c] / 2)), LENS
     ),
     "the same video twice": Kind(
-        lambda s, c, r: with_camera(s.observations, c, s.observations.keypoints[(c + 1) % s.observations.num_cameras]), SAME
+        lambda s, c, r: with_camera(s.observations, c, s.observations.keypoints[(c + 1) % s.observations.num_cameras]),
+        SAME,
+        elsewhere=True,
     ),
-    "two cameras at one place": Kind(lambda s, c, r: with_camera(s.observations, c, second_view(s, c, 0.01, r)), SAME),
+    "two cameras at one place": Kind(
+        lambda s, c, r: with_camera(s.observations, c, second_view(s, c, 0.01, r)), SAME, elsewhere=True
+    ),
     "no baseline": Kind(lambda s, c, r: no_baseline(s, r), (*SAME, "noise_large"), cameras=2),
     "a camera moved 0.5 degrees": Kind(
-        lambda s, c, r: replace(s.observations, keypoints=knocked(s, c, _half(s, r), 0.5, 0.0, r)), MOVED
+        lambda s, c, r: replace(s.observations, keypoints=knocked(s, c, _half(s, r), 0.5, 0.0, r)), MOVED, elsewhere=True
     ),
     "a camera moved 30 mm": Kind(
-        lambda s, c, r: replace(s.observations, keypoints=knocked(s, c, _half(s, r), 0.0, 0.03, r)), MOVED
+        lambda s, c, r: replace(s.observations, keypoints=knocked(s, c, _half(s, r), 0.0, 0.03, r)), MOVED, elsewhere=True
     ),
     "a camera moved 8 degrees and 0.3 m": Kind(
-        lambda s, c, r: replace(s.observations, keypoints=knocked(s, c, _half(s, r), 8.0, 0.3, r)), MOVED
+        lambda s, c, r: replace(s.observations, keypoints=knocked(s, c, _half(s, r), 8.0, 0.3, r)), MOVED, elsewhere=True
     ),
     "a camera drifted 1 degree": Kind(
         lambda s, c, r: replace(
             s.observations, keypoints=knocked(s, c, torch.linspace(0, 1, s.observations.num_frames).double(), 1.0, 0.0, r)
         ),
         MOVED,
+        elsewhere=True,
     ),
     "one camera 8 frames late": Kind(lambda s, c, r: later(s, c, 8), CLOCK),
     "one camera lost 6 frames": Kind(lambda s, c, r: dropped(s, c, s.observations.num_frames // 2, 6), (*CLOCK, *MOVED)),
@@ -309,7 +316,9 @@ class Outcome:
         return self.verdict in ("good", "usable") and self.error_m > max(5 * self.std_m, 0.01 * self.rig_m)
 
 
-def judged(given: SimulatedSession, observations: Observations, auto: bool, name: str = "") -> Outcome:
+def judged(
+    given: SimulatedSession, observations: Observations, auto: bool, name: str = "", compared: list[int] | None = None
+) -> Outcome:
     try:
         began = time.perf_counter()
         calibration = calibrate(observations, refine="auto" if auto else None)
@@ -318,7 +327,9 @@ def judged(given: SimulatedSession, observations: Observations, auto: bool, name
         judging = time.perf_counter() - middle
     except CalibrationError as error:
         return Outcome(name, observations.num_cameras, "refused", [type(error).__name__])
-    errors = pose_errors(calibration.rotations, calibration.translations, given.truth.rotations, given.truth.translations)
+    own = list(range(observations.num_cameras)) if compared is None else compared
+    truth = given.truth.rotations[own], given.truth.translations[own]
+    errors = pose_errors(calibration.rotations[own], calibration.translations[own], *truth)
     centres = calibration.camera_centres
     found = [finding.code for finding in quality.findings if finding.severity > 0]
     return Outcome(
@@ -357,6 +368,11 @@ def sound(count: int, seed: int) -> None:
     )
 
 
+def _compared(kind: Kind, camera: int, cameras: int) -> list[int]:
+    """The cameras whose places are compared."""
+    return [other for other in range(cameras) if not kind.elsewhere or other != camera]
+
+
 def bad(count: int, seed: int) -> None:
     """Bad sessions of every kind, and combinations of two."""
     outcomes: dict[str, list[Outcome]] = collections.defaultdict(list)
@@ -369,7 +385,7 @@ def bad(count: int, seed: int) -> None:
         given = session(number, rng, cameras, outliers=float(rng.uniform(0, 0.1)))
         camera = int(rng.integers(cameras))
         observations = kinds[0].make(given, camera, rng)
-        outcome = judged(given, observations, bool(number // len(names) % 2), given.name)
+        outcome = judged(given, observations, bool(number // len(names) % 2), given.name, _compared(kinds[0], camera, cameras))
         outcome.right = not kinds[0].codes or bool(outcome.codes and outcome.codes[0] in kinds[0].codes)
         outcomes[chosen[0]].append(outcome)
         if outcome.confidently_wrong or not outcome.right:

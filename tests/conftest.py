@@ -18,6 +18,7 @@ from torchstickcal.model.state import State
 from torchstickcal.model.unknowns import REFINEMENTS
 from torchstickcal.observations import Observations
 from torchstickcal.registry import Registry
+from torchstickcal.quality.registry import FAMILIES
 from torchstickcal.simulate import SPORTS, Noise, golf_session
 
 _DATA = Path(os.environ.get("TORCHSTICKCAL_DATA", Path(__file__).parents[2] / "shared" / "data"))
@@ -35,7 +36,7 @@ def data() -> Path:
 def own_parts(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[tuple[Registry, ...]]:
     """The registries; forget at the end of the test what it registered, and the modules that it wrote and imported."""
     readers = (CALIBRATION_READERS, KEYPOINT_READERS, SESSION_READERS)
-    registries = (BASELINES, *readers, CALIBRATION_WRITERS, LOSSES, REFINEMENTS, SPORTS)
+    registries = (BASELINES, *readers, CALIBRATION_WRITERS, FAMILIES, LOSSES, REFINEMENTS, SPORTS)
     for registry in registries:
         monkeypatch.setattr(registry, "_things", dict(registry))
     yield registries

@@ -16,7 +16,7 @@ from torchstickcal.simulate.session import read_simulated
 TEXT = (Path(__file__).parents[1] / "CONTRIBUTING.md").read_text("utf-8")
 RECIPES = dict(re.findall(r"`[\w/]+/(\w+)\.py`:\n\n```python\n(.*?)```", TEXT, flags=re.DOTALL))
 
-NAMES = {"equal_forearms", "aspect", "aspect_shared", "tracks", "positions", "tennis", "stick_and_height"}
+NAMES = {"equal_forearms", "aspect", "aspect_shared", "low_frame_rate", "tracks", "positions", "tennis", "stick_and_height"}
 
 
 @pytest.fixture(autouse=True)
@@ -39,8 +39,13 @@ def calibrated(tmp_path: Path, *options: str) -> Calibration:
     return Calibration.load(tmp_path / "out" / "points.npz")
 
 
-def test_there_are_five():
-    assert set(RECIPES) == {"equal_forearms", "aspect", "tracks", "tennis", "stick_and_height"}
+def test_there_are_six():
+    assert set(RECIPES) == {"equal_forearms", "aspect", "low_frame_rate", "tracks", "tennis", "stick_and_height"}
+
+
+def test_finding(tmp_path: Path):
+    calibration = calibrated(tmp_path, *plugin("low_frame_rate", tmp_path))
+    assert [finding.code for finding in calibration.quality.reasons] == ["low_frame_rate"]
 
 
 def test_loss(tmp_path: Path):

@@ -202,7 +202,10 @@ class Observations:
         if wrong := [camera for camera in cameras if camera not in range(self.num_cameras)]:
             expected = f"indices from 0 to {self.num_cameras - 1}"
             raise ObservationError("no such camera", where="cameras", got=wrong[0], expected=expected)
-        own = list(cameras)
+        return self._chosen(list(cameras), [self.camera_label(camera) for camera in cameras])
+
+    def _chosen(self, own: list[int], names: Sequence[str]) -> Observations:
+        """The same observations of some of the cameras, which get names."""
 
         def chosen(given: Tensor | None, of_one: int) -> Tensor | None:
             return given if given is None or given.ndim == of_one else given[own]
@@ -215,7 +218,7 @@ class Observations:
             confidence=chosen(self.confidence, 2),
             image_size=chosen(self.image_size, 1),
             timestamps=chosen(self.timestamps, 1),
-            camera_names=[self.camera_label(camera) for camera in own],
+            camera_names=names,
         )
 
     def with_camera_split(self, camera: int, frame: int) -> Observations:
@@ -234,11 +237,11 @@ class Observations:
             raise ObservationError(
                 "a camera cannot be split there", where="frame", got=frame, expected=f"a frame from 1 to {self.num_frames - 1}"
             )
-        both = self.of_cameras([*range(self.num_cameras), camera])
+        names = [*self.camera_labels, f"{self.camera_label(camera)} from frame {frame}"]
+        both = self._chosen([*range(self.num_cameras), camera], names)
         keypoints = both.keypoints.clone()
         keypoints[camera, frame:], keypoints[-1, :frame] = torch.nan, torch.nan
-        names = [*self.camera_labels, f"{self.camera_label(camera)} from frame {frame}"]
-        return replace(both, keypoints=keypoints, camera_names=names)
+        return replace(both, keypoints=keypoints)
 
     def with_stick_length(self, length_m: float) -> Observations:
         """The same observations with another length for their only stick.

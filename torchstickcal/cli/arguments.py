@@ -92,8 +92,8 @@ def _add_check(commands: Any) -> None:
     command = commands.add_parser(
         "check",
         help="is an old calibration still valid for a new session of the same cameras?",
-        description="Say whether an old calibration is still valid for a new session of the same cameras: which camera moved, how "
-        "far, and since when. The exit status is 0 if it is valid, 3 if it is not.",
+        description="Say whether an old calibration is still valid for a new session of the same cameras: which camera moved, "
+        "how far, and since when. The exit status is 0 if it is valid, 3 if it is not.",
     )
     command.add_argument(
         "calibration", metavar="CALIBRATION", type=_path, help="folder that `calibrate` wrote, or a calibration file"
@@ -252,6 +252,6 @@ def _add_plugin(command: argparse.ArgumentParser) -> None:
         metavar="MODULE|FILE.py",
         action="append",
         default=[],
-        help="a Python module of yours that registers losses, camera unknowns, findings, file formats, sports or baselines; may be given "
-        "several times. It is a program that is run with your rights: use only what you trust",
+        help="a Python module of yours that registers losses, camera unknowns, findings, file formats, sports or baselines; "
+        "may be given several times. It is a program that is run with your rights: use only what you trust",
     )

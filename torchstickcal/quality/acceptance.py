@@ -187,7 +187,7 @@ def _only(kept: Measurements, points: Tensor) -> Measurements:
 
 
 def _metre(predictions: list[Prediction]) -> tuple[float, float]:
-    """Half the width of the 95 % interval of a length of 1 m where the sticks were, and the calibration's share of its variance.
+    """Half the width of the 95 % interval of a length of 1 m where the sticks were, and the calibration's share of it.
 
     The error by the cameras is taken to grow with the length, as that of the scale does.
     """

@@ -36,6 +36,9 @@ _PRIOR_M, _PRIOR_RAD = 0.3, 0.2
 _HARMLESS_DEG, _HARMLESS_M = 0.05, 0.003
 """A change that no lab would calibrate again for."""
 _LEAST_AGREEING, _SOUND_SHARE = 0.5, 0.6
+_BEHIND_OTHERS, _LOST_SHARE = 0.85, 0.3
+"""Share of a camera over the median, below which it is looked at whether its keypoints ceased to agree at some frame, and the
+share that must have."""
 _WRONG_LENGTH_SHARE = 0.02
 
 
@@ -68,7 +71,7 @@ def check(calibration: Calibration | OldRig, observations: Observations) -> Qual
 
     Args:
         calibration: the old one.
-        observations: the new recording, with keypoints of the same cameras at the same time. Sticks are compared if there are any.
+        observations: the new recording, with keypoints of the same cameras at the same time. Sticks are compared too.
 
     Returns:
         The verdict: good where no camera moved, else with a finding for each camera that did: how far, and since when.
@@ -137,7 +140,8 @@ class _Rig:
         pull, own = self.pulls.gradient[:, camera].sum(0), self.pulls.information[:, place, place].sum(0)
         prior = pull.new_tensor([1 / _PRIOR_M**2] * 3 + [1 / _PRIOR_RAD**2] * 3).diag()
         change = torch.linalg.solve(own + prior, pull)
-        scatter = _lasting(self.pulls.gradient_by_part[:, camera], self.pulls.information[:, place, place])
+        parts = self.pulls.information[:, place, place]
+        scatter = _lasting(self.pulls.gradient_by_part[:, camera] - parts @ change, parts)
         covariance = scatter * torch.linalg.inv(own + prior)
         if not exact:
             covariance = covariance + self.old.variance_of(camera).to(pull)
@@ -170,11 +174,11 @@ class _Rig:
 def _checked(old: OldRig, observations: Observations) -> Quality:
     rig = _Rig(old, observations)
     cameras = range(observations.num_cameras)
-    since = motion_of(rig.pulls, rig.rotations, rig.translations)
     found: list[Finding] = []
-    if since is not None and since.evidence > LEAST_EVIDENCE and not since.gradual and len(cameras) > 2:
-        rig.place_again(since.camera, since.frame)
-        found.append(_change(rig, observations, since.camera, since.evidence, since.frame))
+    if (step := _step_within(rig)) is not None and len(cameras) > 2:
+        camera, place, strength = step
+        rig.place_again(camera, place)
+        found.append(_change(rig, observations, camera, strength, place))
     for _ in range(max(1, len(cameras) - 2)):
         left = [camera for camera in cameras if camera not in rig.moved]
         doubtful = [camera for camera in left if float(rig.shares[camera]) < _LEAST_AGREEING]
@@ -192,8 +196,8 @@ def _checked(old: OldRig, observations: Observations) -> Quality:
                 "camera_contradicts",
                 Severity.FATAL,
                 f"{name}: only {share:.0%} of its keypoints agree with the calibration, wherever it is.",
-                "Check that the recording is of the same cameras in the same order, and that all show the same athlete at the same "
-                "time.",
+                "Check that the recording is of the same cameras in the same order, and that all show the same athlete at the "
+                "same time.",
                 cameras=(name,),
                 figure=share,
                 limit=_LEAST_AGREEING,
@@ -202,6 +206,30 @@ def _checked(old: OldRig, observations: Observations) -> Quality:
         )
     found += _lengths(rig, observations)
     return Quality.of(found)
+
+
+def _step_within(rig: _Rig) -> tuple[int, int, float] | None:
+    """The camera that moved during the recording, the first of the frames after it, and the evidence; None if none did.
+
+    After a large step few keypoints of the camera agree, after a small one they pull at it.
+    """
+    shares = rig.shares
+    camera = int(shares.argmin())
+    if float(shares[camera]) < _BEHIND_OTHERS * float(shares.median()):
+        m = rig.measurements
+        seen = m.by_frame(m.visible[0])[camera].sum(-1).double()
+        missing = rig.agreeing[0, camera].sum(-1).double() - float(shares[camera]) * seen
+        place = int(missing.cumsum(0).argmax()) + 1
+        before, after = (
+            float(rig.agreeing[0, camera][part].sum() / seen[part].sum().clamp_min(1))
+            for part in (slice(place), slice(place, None))
+        )
+        if before - after > _LOST_SHARE and 0 < place < m.frames:
+            return camera, place, torch.inf
+    since = motion_of(rig.pulls, rig.rotations, rig.translations)
+    if since is None or since.evidence < LEAST_EVIDENCE or since.gradual:
+        return None
+    return since.camera, since.frame, since.evidence
 
 
 def _change(rig: _Rig, observations: Observations, camera: int, strength: float, place: int = 0) -> Finding:
@@ -259,7 +287,7 @@ def _lasting(pull: Tensor, own: Tensor) -> float:
     """Variance of the sum of pulls (K, 6), over that of independent keypoints, at least 1."""
     mean = own.mean(0)
     root = torch.linalg.cholesky(mean + 1e-9 * mean.diagonal().mean().clamp_min(1e-300) * torch.eye(6).to(mean))
-    white = torch.linalg.solve_triangular(root, (pull - pull.mean(0)).mT, upper=False).mT
+    white = torch.linalg.solve_triangular(root, pull.mT, upper=False).mT
     found = [1.0]
     for blocks in (12, 24, len(white)):
         length = max(1, len(white) // blocks)

@@ -25,10 +25,11 @@ from torchstickcal.result import CameraParameter
 from torchstickcal.solvers.uncertainty import centre_covariances, relative_scale_std
 
 _CONSISTENT_SHARE, _BEHIND_OTHERS, _NOISY_MRAD = 0.62, 0.85, 10.0
-"""Least share of a camera's keypoints that agree, also over that of the median camera, and noise of the keypoints, of a rig whose
-cameras see one scene. Sound cameras keep 84 % and more, with 20 % of wrong keypoints 66 %."""
+"""Least share of a camera's keypoints that agree, also over that of the median camera, and noise of the keypoints, of a rig
+whose cameras see one scene. Sound cameras keep 84 % and more, with 20 % of wrong keypoints 66 %."""
 _NEAR_FOCAL = 0.3
-"""Logarithm of an estimated over the given focal length: from here on, something else is wrong."""
+"""Logarithm of an estimated or suggested over the given focal length: from here on, something else is wrong."""
+_FAR_SIGMAS = 8.0
 _OTHER_PERSON_SHARE = 0.2
 """Share of a camera's frames that were set aside as those of another person, from which on the camera itself is doubted."""
 
@@ -107,12 +108,16 @@ class Evidence:
 
     @cached_property
     def consistent(self) -> bool:
-        """Whether all cameras agree with each other as those of one scene do, so that small errors can be told by linearising."""
+        """Whether all cameras agree with each other as those of one scene do, so that linearising tells small errors."""
         least, median = float(self.agreement.min()), float(self.agreement.median())
         agree = least > max(_CONSISTENT_SHARE, _BEHIND_OTHERS * median)
         person = float(self.ended.labels.other_person[0].double().mean(1).max()) < _OTHER_PERSON_SHARE
-        focal = self.measurements.cameras_at(self.state).focal_px[0] / self.measurements.cameras.focal_px[0]
-        near = not self.observations.intrinsics_known or float(focal.log().abs().max()) < _NEAR_FOCAL
+        focal = self.unknowns["focal"]
+        wanted = focal.value if focal.refined else focal.suggested
+        far = ((wanted / focal.given).clamp_min(1e-3).log().abs() > _NEAR_FOCAL) & (
+            self.contradictions["focal"] > _FAR_SIGMAS**2
+        )
+        near = not self.observations.intrinsics_known or not bool(far.any())
         return self.ended.converged and agree and person and near and self.noise_mrad < _NOISY_MRAD
 
     @cached_property
@@ -122,8 +127,10 @@ class Evidence:
 
     @cached_property
     def centre_std_m(self) -> Tensor:
-        """(C,), standard deviation of each camera's centre, metres; NaN where cameras were not estimated."""
-        return centre_covariances(self.centres, self._pose_covariance).diagonal(dim1=1, dim2=2).sum(1).sqrt()
+        """(C,), standard deviation of each camera's centre by the errors of the keypoints, metres; NaN where cameras were not
+        estimated."""
+        poses = slice(0, 6 * (self.cameras - 1))
+        return centre_covariances(self.centres, self.noise[poses, poses]).diagonal(dim1=1, dim2=2).sum(1).sqrt()
 
     @cached_property
     def scale_std(self) -> float:
@@ -162,12 +169,12 @@ class Evidence:
     @cached_property
     def contradictions(self) -> dict[str, Tensor]:
         """(C,), by the name of what may be unknown of the cameras: squared length, in standard deviations, of the difference
-        between what the keypoints suggest and what was given; 0 where it was estimated or is not known."""
+        between what the keypoints suggest and what was given; 0 where it is not known."""
         found: dict[str, Tensor] = {}
         for name, parameter in self.unknowns.items():
             difference = (parameter.by_component("suggested") - parameter.by_component("given")).double()
             squared = (difference / parameter.by_component("suggested_std").double()).square().sum(1)
-            found[name] = squared.nan_to_num(0.0, 0.0, 0.0) * (not parameter.refined)
+            found[name] = squared.nan_to_num(0.0, 0.0, 0.0)
         return found
 
     def explains_most(self, name: str) -> bool:
@@ -179,7 +186,8 @@ class Evidence:
         strengths = {"motion": 0.0 if self.motion is None else self.motion.evidence, "lens": 0.0, "clock": 0.0}
         for unknown, squared in self.contradictions.items():
             family = all_unknowns()[unknown].family
-            strengths[family] = max(strengths.get(family, 0.0), float(squared.max()))
+            if not self.unknowns[unknown].refined:
+                strengths[family] = max(strengths[family], float(squared.max()))
         return strengths[name] >= max(strengths.values())
 
     @cached_property

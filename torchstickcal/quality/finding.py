@@ -9,7 +9,12 @@ from typing import Any
 
 
 class Severity(enum.IntEnum):
-    """What a finding means for the result."""
+    """What a finding means for the result.
+
+    Example:
+        >>> Severity.SERIOUS > Severity.CAUTION
+        True
+    """
 
     NOTE = 0
     """worth knowing; the result is not affected"""

@@ -19,10 +19,12 @@ def _judged(evidence: Evidence) -> Quality:
     found = {family: list(family.look(evidence)) for family in first}
     every = [finding for own in found.values() for finding in own]
     wrong = any(finding.severity >= Severity.SERIOUS for finding in every)
-    told = evidence.consistent and any(finding.is_cause for finding in every)
-    if (wrong or not evidence.consistent) and not told:
+    large = any(finding.is_cause for family, own in found.items() if not family.small for finding in own)
+    told = large or (evidence.consistent and any(finding.is_cause for finding in every))
+    doubtful = any(finding.code == "camera_doubtful" for finding in every)
+    if (wrong or doubtful) and not told:
         causes = [finding for family in FAMILIES.values() if family.tries for finding in family.look(evidence)]
         if causes:
             every = [finding for family, own in found.items() if not family.small for finding in own]
-        every = [*causes, *every]
+        every += causes
     return Quality.of(every, evidence.acceptance)

@@ -21,7 +21,9 @@ _ROUNDS, _REACH_SIGMAS = 400, 8.0
 _STEPS = 12
 _KERNEL_SIGMAS = 6.0
 AGREEING_SIGMAS = 4.5
-"""Distance in the image within which a keypoint agrees with a point that has an error of its own."""
+LEAST_REACH = 0.006
+"""Distance in the image, in noise and at least in focal lengths, within which a keypoint agrees with a point that has an error
+of its own."""
 
 
 class Resection(NamedTuple):
@@ -79,8 +81,9 @@ def resected(
     if not bool(rotation.isfinite().all() and translation.isfinite().all()):
         return None
     in_camera = rotation @ points + translation[:, None]
+    reach = (AGREEING_SIGMAS * sigma_px).clamp_min(LEAST_REACH * float(camera.focal_px.mean()))
     distance = (camera.project(in_camera.mT[None])[0].mT - pixels).norm(dim=0)
-    agreeing = (distance < AGREEING_SIGMAS * sigma_px) & (in_camera[2] > 0)
+    agreeing = (distance < reach) & (in_camera[2] > 0)
     return Resection(rotation, translation, agreeing, moments)
 
 

@@ -16,7 +16,7 @@ from torchstickcal.observations import Observations
 from torchstickcal.pipeline.adjust import Adjustment, adjust_cameras, begin
 from torchstickcal.pipeline.run import Run
 from torchstickcal.quality.evidence import Evidence
-from torchstickcal.quality.resection import AGREEING_SIGMAS, Resection, resected
+from torchstickcal.quality.resection import AGREEING_SIGMAS, LEAST_REACH, Resection, resected
 
 _SCALES = (1 / 3, 0.5, 2 / 3, 0.75, 4 / 3, 1.5, 2.0, 3.0)
 """Ratios of resolutions that videos are commonly converted by."""
@@ -62,7 +62,8 @@ def hypotheses() -> Iterator[Hypothesis]:
     )
     yield Hypothesis(
         "intrinsics_turned",
-        "its intrinsics are those of a video turned by 90 degrees: with the coordinates of the centre exchanged its keypoints agree",
+        "its intrinsics are those of a video turned by 90 degrees: with the coordinates of the centre exchanged its keypoints "
+        "agree",
         "Give the intrinsics of the video as the detector saw it.",
         _turned,
     )
@@ -223,5 +224,6 @@ def _agreeing(placed: Resection, rest: Rest, sight: Sight, usable: Tensor) -> Te
     """(F, P), the keypoints that agree with a camera at some place."""
     in_camera = torch.einsum("ij,jfp->fpi", placed.rotation, rest.points) + placed.translation
     pixels = sight.camera.project(in_camera.nan_to_num().flatten(0, 1)[None])[0].view(*usable.shape, 2)
-    near = (pixels - sight.keypoints).norm(dim=-1) < AGREEING_SIGMAS * rest.sigma_px
+    reach = (AGREEING_SIGMAS * rest.sigma_px).clamp_min(LEAST_REACH * float(sight.camera.focal_px.mean()))
+    near = (pixels - sight.keypoints).norm(dim=-1) < reach
     return near & usable & (in_camera[..., 2] > 0)

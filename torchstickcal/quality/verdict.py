@@ -11,7 +11,12 @@ from torchstickcal.quality.finding import Finding, Severity
 
 
 class Verdict(enum.StrEnum):
-    """Whether a result can be used."""
+    """Whether a result can be used.
+
+    Example:
+        >>> Verdict.USABLE.acceptable, Verdict.POOR.acceptable, str(Verdict.POOR)
+        (True, False, 'poor')
+    """
 
     GOOD = "good"
     """nothing speaks against it"""
@@ -45,7 +50,7 @@ class LengthErrors:
     frames: int
     """number of lengths"""
     wrong: int
-    """number of them that are wrong, by more than 6 of their standard deviations: they are in ``inside``, but not in the errors"""
+    """number of them that are wrong, by more than 6 standard deviations: they are in ``inside``, but not in the errors"""
     largest_m: float
     """the error of largest absolute value"""
     mean_m: float

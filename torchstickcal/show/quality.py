@@ -50,9 +50,9 @@ def _accepted(acceptance: Acceptance) -> list[str]:
     for one in acceptance.lengths:
         x, y, z = one.volume_m
         lines.append(
-            f"{one.stick}, in {one.frames} frames that took no part{_wrong(one.wrong)}: errors largest {1000 * one.largest_m:+.2f} mm, mean "
-            f"{1000 * one.mean_m:+.2f} mm, standard deviation {1000 * one.std_m:.2f} mm, {one.inside:.0%} inside their 95 % "
-            f"intervals, in {x:.2g} x {y:.2g} x {z:.2g} m"
+            f"{one.stick}, in {one.frames} frames that took no part{_wrong(one.wrong)}: errors largest "
+            f"{1000 * one.largest_m:+.2f} mm, mean {1000 * one.mean_m:+.2f} mm, standard deviation "
+            f"{1000 * one.std_m:.2f} mm, {one.inside:.0%} inside their 95 % intervals, in {x:.2g} x {y:.2g} x {z:.2g} m"
         )
     lines.append(
         f"reprojection {acceptance.reprojection_px:.2f} px ({acceptance.reprojection_mrad:.2f} mrad), rays "

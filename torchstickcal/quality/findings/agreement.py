@@ -71,7 +71,8 @@ def _shares(evidence: Evidence) -> Iterator[Finding]:
             yield Finding(
                 "camera_contradicts",
                 Severity.SERIOUS,
-                f"{name}: only {share:.0%} of its keypoints agree with the other cameras; of a sound camera it is more than 80 %.",
+                f"{name}: only {share:.0%} of its keypoints agree with the other cameras; of a sound camera it is more "
+                "than 80 %.",
                 "Check that it shows the same athlete at the same time, that the video is not mirrored or turned, and that its "
                 "intrinsics are right.",
                 limit=_AGREEING_SHARE,
@@ -138,8 +139,8 @@ def _precision(evidence: Evidence) -> Iterator[Finding]:
             yield Finding(
                 "camera_imprecise",
                 Severity.SERIOUS if lost else Severity.CAUTION,
-                f"{evidence.camera(camera)}: its centre has a standard deviation of {1000 * std:.3g} mm, {std / rig:.1%} of the "
-                "size of the rig.",
+                f"{evidence.camera(camera)}: its centre has a standard deviation of {1000 * std:.3g} mm, {std / rig:.1%} of "
+                "the size of the rig.",
                 "Record a longer motion that fills more of the images, or add cameras.",
                 cameras=(evidence.camera(camera),),
                 figure=std / rig,

@@ -15,8 +15,8 @@ _SEGMENTS = {("knee", "ankle"): 0.246, ("hip", "knee"): 0.245, ("shoulder", "elb
 """Lengths of segments as shares of the standing height (Drillis and Contini 1966, in Winter's tables)."""
 _TALL_M, _SHORT_M = 2.10, 1.35
 _TALLEST_M, _SHORTEST_M = 2.4, 1.1
-"""Standing heights, by the segments, that are unusual, and those that no athlete has. Heights from a detector's joints are wrong
-by up to 8 %."""
+"""Standing heights, by the segments, that are unusual, and those that no athlete has. Heights from a detector's joints are
+wrong by up to 8 %."""
 _LEAST_FRAMES = 15
 _MIRRORED_SHARE = 0.8
 
@@ -59,13 +59,13 @@ def _height(evidence: Evidence, places: dict[str, int]) -> Iterator[Finding]:
     yield Finding(
         "athlete_height",
         Severity.SERIOUS if impossible else Severity.CAUTION,
-        f"By the lengths of the limbs the athlete is {height:.2f} m tall: if that is not so, the length of the stick, and with it "
-        "the scale, is wrong by the same share.",
+        f"By the lengths of the limbs the athlete is {height:.2f} m tall: if that is not so, the length of the stick, and with "
+        "it the scale, is wrong by the same share.",
         "Check the length of the stick, its unit, and which points are its ends.",
         figure=height,
         limit=_TALL_M if height > _TALL_M else _SHORT_M,
         unit="m",
-        is_cause=True,
+        is_cause=evidence.consistent,
     )
 
 
@@ -110,11 +110,11 @@ def _mirrored(evidence: Evidence, places: dict[str, int]) -> Iterator[Finding]:
         yield Finding(
             "scene_mirrored",
             Severity.SERIOUS,
-            f"In {share:.0%} of the frames the athlete's right side is on the left: all videos are mirrored, and the rig is its "
-            "own mirror image, or the names of left and right are exchanged.",
+            f"In {share:.0%} of the frames the athlete's right side is on the left: all videos are mirrored, and the rig is "
+            "its own mirror image, or the names of left and right are exchanged.",
             "Mirror the keypoints of all cameras, x to width - 1 - x, or exchange the names.",
             figure=share,
             limit=_MIRRORED_SHARE,
             unit="share",
-            is_cause=True,
+            is_cause=evidence.consistent,
         )

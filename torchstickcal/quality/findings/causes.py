@@ -13,10 +13,15 @@ from torchstickcal.quality.registry import findings
 from torchstickcal.quality.trials import Rest, Sight, hypotheses, moved_within, shifted_share, sight_of, tried, without
 
 _SOUND_SHARE, _GAIN, _CLEAR_GAIN = 0.6, 0.15, 0.08
-"""Share of keypoints that agree in a sound camera, and the least gain of an explanation over none, where that is wrong and where
-it is nearly right."""
+"""Share of keypoints that agree in a sound camera, and the least gain of an explanation over none, where that is wrong and
+where it is nearly right."""
+_WHOLE_SHARE = 0.8
+_ALIEN_SHARE = 0.75
+"""Share of a camera's keypoints that agree, over that of the others, below which it shows something else."""
+_FARTHEST_DEG, _FARTHEST_SHARE = 45.0, 0.3
+"""Largest change of a camera that is a motion of it, the shift as a share of the rig; beyond, it shows something else."""
 _MOST_SUSPECTS = 4
-_BEHIND_OTHERS = 0.9
+_BEHIND_OTHERS = 0.8
 _SUSPECT_SHARE = 0.8
 _NOISE_RATIO = 0.6
 
@@ -74,6 +79,10 @@ def _explained(evidence: Evidence, camera: int, rest: Rest) -> Finding | None:
     hypothesis, share = max(found, key=lambda one: one[1], default=(None, 0.0))
     if hypothesis is not None and share > max(_SOUND_SHARE, as_given + (_GAIN if as_given < _SOUND_SHARE else _CLEAR_GAIN)):
         return cause(hypothesis.code, hypothesis.what, hypothesis.advice, share)
+    if as_given < _WHOLE_SHARE and (moved := moved_within(rest, sight)) is not None:
+        finding = _moved(evidence, camera, *moved)
+        if finding is not None:
+            return finding
     if as_given > _SOUND_SHARE:
         if as_given < float(evidence.agreement[camera]) + _CLEAR_GAIN:
             return None
@@ -83,8 +92,6 @@ def _explained(evidence: Evidence, camera: int, rest: Rest) -> Finding | None:
             "Calibrate the other cameras first, or give a session in which this camera shares more with them.",
             as_given,
         )
-    if (moved := moved_within(rest, sight)) is not None:
-        return _moved(evidence, camera, *moved)
     later, share = shifted_share(rest, sight, evidence.ended.frames[0].rate_hz)
     if later and share > _SOUND_SHARE and share > as_given + _GAIN:
         word = "later" if later > 0 else "earlier"
@@ -94,20 +101,24 @@ def _explained(evidence: Evidence, camera: int, rest: Rest) -> Finding | None:
             "Estimate the time offsets (refine 'time_offset'), or cut its video to begin with the others.",
             share,
         )
+    if float(evidence.agreement[camera]) > _ALIEN_SHARE * rest.share:
+        return None
     return cause(
         "camera_alien",
-        "its keypoints agree with the other cameras at no place, neither mirrored, turned, scaled nor moved in time: it shows "
-        "another person or another recording",
-        "Check which person the detector follows in this camera, and that the video belongs to this session. Leave it out else.",
+        "its keypoints agree with the other cameras at no place, neither mirrored, turned, scaled nor moved in time: it "
+        "shows another person or another recording",
+        "Check which person the detector follows in this camera, and whether the video belongs to this session.",
         max([as_given, *(share for _, share in found)]),
     )
 
 
-def _moved(evidence: Evidence, camera: int, frame: int, before: object, after: object) -> Finding:
+def _moved(evidence: Evidence, camera: int, frame: int, before: object, after: object) -> Finding | None:
     name = evidence.camera(camera)
     poses = [(one.rotation, one.translation) for one in (before, after)]  # type: ignore[attr-defined]
     angle = float(rotation_angle(poses[1][0] @ poses[0][0].mT).rad2deg())
     shift = float((se3.camera_centres(*poses[1]) - se3.camera_centres(*poses[0])).norm())
+    if angle > _FARTHEST_DEG or shift > _FARTHEST_SHARE * evidence.rig_m:
+        return None
     return Finding(
         "camera_moved",
         Severity.SERIOUS,

@@ -49,8 +49,8 @@ def _intrinsics(evidence: Evidence) -> Iterator[Finding]:
         yield Finding(
             code,
             Severity.CAUTION if code == "principal_point_off_centre" else Severity.SERIOUS,
-            f"{name}: the principal point of its intrinsics is ({x:.0f}, {y:.0f}), but its images are {width} x {height} pixels: "
-            f"{what}.",
+            f"{name}: the principal point of its intrinsics is ({x:.0f}, {y:.0f}), but its images are {width} x {height} "
+            f"pixels: {what}.",
             "Give the intrinsics of the images that the detector saw.",
             cameras=(name,),
             figure=float(off[camera]),

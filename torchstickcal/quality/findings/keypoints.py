@@ -36,10 +36,17 @@ def _values(evidence: Evidence) -> Iterator[Finding]:
     total = max(1, int(visible.sum()))
     for sentence in observations.warnings:
         share = int(((observations.keypoints == 0).all(-1) & visible).sum()) / total
-        severity = Severity.CAUTION if share > _CORNER_SHARE else Severity.NOTE
+        many = share > _CORNER_SHARE
         meaning, advice = sentence.rsplit(" Set them", 1)
         yield Finding(
-            "keypoints_at_corner", severity, meaning, f"Set them{advice}", figure=share, limit=_CORNER_SHARE, unit="share"
+            "keypoints_at_corner",
+            Severity.SERIOUS if many else Severity.NOTE,
+            meaning,
+            f"Set them{advice}",
+            figure=share,
+            limit=_CORNER_SHARE,
+            unit="share",
+            is_cause=many,
         )
     given = observations.keypoints[visible]
     noise = float(evidence.sigma_px.median())
@@ -47,7 +54,8 @@ def _values(evidence: Evidence) -> Iterator[Finding]:
         yield Finding(
             "whole_pixels",
             Severity.NOTE,
-            f"All keypoints are whole numbers of pixels, but their noise is only {noise:.2g} px, so that rounding is a part of it.",
+            f"All keypoints are whole numbers of pixels, but their noise is only {noise:.2g} px, so that "
+            "rounding is a part of it.",
             "Write the keypoints with decimals.",
             figure=noise,
             limit=_WHOLE_PX_NOISE,
@@ -76,8 +84,8 @@ def _labels(evidence: Evidence) -> Iterator[Finding]:
             yield Finding(
                 "other_person",
                 Severity.SERIOUS if count > _OTHER_PERSON_SHARE * frames else Severity.NOTE,
-                f"{evidence.camera(camera)}: {count} of {frames} frames were not used: all their keypoints contradict the other "
-                "cameras, as if they showed another person.",
+                f"{evidence.camera(camera)}: {count} of {frames} frames were not used: all their keypoints contradict the "
+                "other cameras, as if they showed another person.",
                 "Check which person the detector follows in this camera." if count > _OTHER_PERSON_SHARE * frames else "",
                 cameras=(evidence.camera(camera),),
                 figure=count / frames,
@@ -132,8 +140,8 @@ def _noise(evidence: Evidence) -> Iterator[Finding]:
         yield Finding(
             "noise_large",
             Severity.SERIOUS,
-            f"The keypoints contradict each other by {float(evidence.sigma_px.median()):.3g} px ({evidence.noise_mrad:.2g} mrad) "
-            "on average, several times more than those of a good detector.",
+            f"The keypoints contradict each other by {float(evidence.sigma_px.median()):.3g} px ({evidence.noise_mrad:.2g} "
+            "mrad) on average, several times more than those of a good detector.",
             "Look at the videos with the keypoints drawn into them, and check the intrinsics.",
             figure=evidence.noise_mrad,
             limit=_NOISY_MRAD,

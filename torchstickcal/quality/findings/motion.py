@@ -11,6 +11,8 @@ from torchstickcal.quality.registry import findings
 
 _HARMLESS_DEG, _HARMLESS_SHARE = 0.2, 0.002
 """A change that is smaller than this angle, and this share of the rig, makes the cameras wrong by less than 1 %."""
+_LEAST_DRIFT = 150.0
+"""Evidence of a drift. Errors of a detector that depend on where the athlete is look alike where he walks along a path."""
 _RIVAL_SHARE = 0.7
 """Evidence against another camera, as a share, from which on it is not certain which of both moved."""
 
@@ -24,6 +26,8 @@ def motion(evidence: Evidence) -> Iterator[Finding]:
     name = evidence.camera(found.camera)
     harmless = found.rotation_deg < _HARMLESS_DEG and found.shift_m < _HARMLESS_SHARE * evidence.rig_m
     amount = f"by {found.rotation_deg:.2g} degrees and {1000 * found.shift_m:.2g} mm"
+    if found.gradual and found.evidence < _LEAST_DRIFT:
+        return
     doubt = found.rival > _RIVAL_SHARE * found.evidence
     which = f"{name}, or a camera beside it," if doubt else name
     last = evidence.observations.num_frames - 1
@@ -37,7 +41,7 @@ def motion(evidence: Evidence) -> Iterator[Finding]:
         frames = (found.frame, last)
     yield Finding(
         "camera_drifted" if found.gradual else "camera_moved",
-        Severity.CAUTION if harmless else Severity.SERIOUS,
+        Severity.CAUTION if harmless or (found.gradual and doubt) else Severity.SERIOUS,
         meaning,
         advice,
         cameras=(name,),
@@ -45,5 +49,5 @@ def motion(evidence: Evidence) -> Iterator[Finding]:
         figure=found.evidence**0.5,
         limit=LEAST_EVIDENCE**0.5,
         unit="standard deviations",
-        is_cause=evidence.consistent,
+        is_cause=True,
     )

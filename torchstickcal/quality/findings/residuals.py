@@ -23,8 +23,8 @@ def residuals(evidence: Evidence) -> Iterator[Finding]:
         yield Finding(
             "errors_last",
             Severity.NOTE,
-            f"The errors of the keypoints are alike for several frames: {times:.0f} frames say as much as one. The deviations allow "
-            "for it.",
+            f"The errors of the keypoints are alike for several frames: {times:.0f} frames say as much as one. The "
+            "deviations allow for it.",
             figure=times,
             limit=_LASTING_FRAMES,
             unit="frames",

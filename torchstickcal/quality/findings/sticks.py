@@ -14,7 +14,7 @@ from torchstickcal.solvers.elimination.normal_equations import NormalEquations
 _WRONG_LENGTH_SHARE, _WRONG_LENGTH_SIGMAS = 0.02, 4.0
 """Deviation of a stick's length from the given one, as a share of it and in tolerances, beyond which it is not the stick."""
 _FEW_FRAMES = 10
-_IMPRECISE_SCALE, _UNKNOWN_SCALE = 0.01, 0.04
+_IMPRECISE_SCALE, _UNKNOWN_SCALE = 0.01, 0.1
 _WORSE_END = 3.0
 """Noise of one end over that of the other."""
 _INSIDE_SHARE, _LEAST_LENGTHS = 0.7, 20
@@ -65,7 +65,8 @@ def _scale(evidence: Evidence) -> Iterator[Finding]:
             yield Finding(
                 "scale_from_few_frames",
                 Severity.CAUTION,
-                f"The scale comes from {frames} of {kept.frames} frames: in the others no two cameras see both ends of a stick.",
+                f"The scale comes from {frames} of {kept.frames} frames: in the others no two cameras see both ends "
+                "of a stick.",
                 "Check the keypoints of the stick's ends, and lower the detector's threshold for them.",
                 figure=frames,
                 limit=_FEW_FRAMES,

@@ -1,0 +1,258 @@
+"""The verdict: what is said of sound and of bad sessions, of lengths that took no part, and of old calibrations."""
+
+from __future__ import annotations
+
+import copy
+import json
+import pickle
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+from torch import Tensor
+
+from torchstickcal import Calibration, Finding, Observations, Quality, Severity, Stick, Verdict, calibrate, check
+from torchstickcal.cli import main
+from torchstickcal.errors import ObservationError
+from torchstickcal.geometry import se3
+from torchstickcal.io import write_npz
+from torchstickcal.quality.linear import FramePulls
+from torchstickcal.quality.moved import motion_of
+from torchstickcal.quality.registry import FAMILIES, findings
+from torchstickcal.quality.resection import resected
+from torchstickcal.simulate import Noise, SessionSpec, SimulatedSession
+from torchstickcal.solvers.elimination.normal_equations import NormalEquations
+
+
+def session(sport: str = "golf", cameras: int = 5, frames: int = 60, seed: int = 1, sigma_px: float = 1.5) -> SimulatedSession:
+    regimes = (Noise(sigma_px, missing=0.05, outliers=0.05),)
+    return SessionSpec(sport, sport, seed, cameras, frames, layout="ring", path="circle", regimes=regimes).generate()
+
+
+def knocked(given: SimulatedSession, camera: int, first: int, turn_deg: float, shift_m: float) -> Observations:
+    """One camera is turned about its vertical axis and shifted sideways from a frame on."""
+    truth, keypoints = given.truth, given.observations.keypoints.clone()
+    assert truth.points is not None
+    lens = given.observations.cameras[camera : camera + 1]
+    turn = torch.tensor([0.0, 0, 0, 0, turn_deg, 0]).double()
+    turn[3:] = turn[3:].deg2rad()
+    in_camera = truth.points @ truth.rotations[camera].mT + truth.translations[camera]
+    after = in_camera @ se3.exp(turn)[0].mT - torch.tensor([shift_m, 0, 0])
+
+    def seen(points: Tensor) -> Tensor:
+        return lens.project(points.flatten(0, 1)[None])[0].view(*points.shape[:2], 2)
+
+    keypoints[camera, first:] += (seen(after) - seen(in_camera))[first:]
+    return replace(given.observations, keypoints=keypoints)
+
+
+def codes(quality: Quality) -> list[str]:
+    return [finding.code for finding in quality.findings]
+
+
+@pytest.mark.parametrize(("sport", "cameras"), [("golf", 3), ("kendo", 6)])
+def test_a_sound_session_is_good(sport: str, cameras: int):
+    calibration = calibrate(session(sport, cameras).observations)
+    quality = calibration.quality
+    assert quality.verdict is Verdict.GOOD
+    assert not quality.reasons
+    assert calibration.warnings == tuple(finding.text for finding in quality.findings)
+    assert quality is calibration.quality
+
+
+def with_camera(observations: Observations, camera: int, change: Callable[[Tensor], Tensor]) -> Observations:
+    keypoints = observations.keypoints.clone()
+    keypoints[camera] = change(keypoints[camera])
+    return replace(observations, keypoints=keypoints)
+
+
+def mirrored(keypoints: Tensor) -> Tensor:
+    return torch.stack([1919 - keypoints[..., 0], keypoints[..., 1]], dim=-1)
+
+
+@pytest.mark.parametrize(
+    ("change", "code"),
+    [
+        (lambda s: with_camera(s.observations, 2, mirrored), "camera_mirrored"),
+        (lambda s: with_camera(s.observations, 0, mirrored), "camera_mirrored"),
+        (lambda s: replace(s.observations, keypoints=mirrored(s.observations.keypoints)), "scene_mirrored"),
+        (lambda s: with_camera(replace(s.observations, image_size=None), 1, lambda k: k / 2), "focal_contradicted"),
+        (lambda s: with_camera(s.observations, 3, lambda k: s.observations.keypoints[1]), "same_video"),
+        (lambda s: s.observations.with_stick_length(3.28), "athlete_height"),
+        (lambda s: replace(s.observations, sticks=[*s.observations.sticks, Stick(0, 1, 0.5)]), "stick_lengths_contradict"),
+        (lambda s: knocked(s, 2, 25, 0.5, 0.0), "camera_moved"),
+        (lambda s: knocked(s, 0, 35, 0.0, 0.04), "camera_moved"),
+        (lambda s: knocked(s, 1, 30, 8.0, 0.3), "camera_moved"),
+    ],
+)  # fmt: skip
+def test_the_cause_is_named_first(change: Callable[[SimulatedSession], Observations], code: str):
+    quality = calibrate(change(session())).quality
+    assert quality.verdict in (Verdict.POOR, Verdict.FAILED)
+    assert codes(quality)[0] == code
+    assert quality.findings[0].is_cause
+
+
+def test_another_recording_in_one_camera_is_named():
+    other = session("kendo", seed=7).observations.keypoints
+    quality = calibrate(with_camera(session().observations, 4, lambda _: other[4])).quality
+    assert not quality.verdict.acceptable
+    assert any(
+        finding.cameras == ("cam05",) and finding.code in ("camera_alien", "camera_unknown") for finding in quality.findings
+    )
+
+
+@pytest.mark.parametrize(("camera", "first"), [(0, 20), (3, 38)])
+@pytest.mark.parametrize(("turn_deg", "shift_m"), [(0.2, 0.0), (0.0, 0.01)])
+def test_a_small_step_is_found_where_it_is(camera: int, first: int, turn_deg: float, shift_m: float):
+    found = [
+        f for f in calibrate(knocked(session(), camera, first, turn_deg, shift_m)).quality.findings if f.code == "camera_moved"
+    ]
+    assert [f.cameras for f in found] == [(f"cam{camera + 1:02d}",)]
+    assert found[0].frames is not None
+    assert abs(found[0].frames[0] - first) <= 2
+
+
+def test_pulls_are_the_reduced_camera_system_frame_by_frame():
+    calibration = calibrate(session(cameras=3, frames=20).observations)
+    assert not isinstance(calibration.judgement, Quality)
+    evidence = calibration.judgement.args[0]  # type: ignore[attr-defined]
+    pulls = FramePulls.of(evidence.kept, evidence.state, evidence.ended.last.sigma_px)
+    from torchstickcal.losses import ReprojectionLoss
+    from torchstickcal.losses.robust import GemanMcClure
+    from torchstickcal.model.objective import Objective
+
+    loss = ReprojectionLoss(evidence.ended.last.sigma_px[:, None, None], kernel=GemanMcClure(6.0))
+    system = NormalEquations(Objective(evidence.kept, {"reprojection": loss}), evidence.state, cameras_free=True)
+    torch.testing.assert_close(pulls.information.sum(0)[6:, 6:], system.reduced[0])
+    torch.testing.assert_close(pulls.gradient.sum(0)[1:].flatten(), system.reduced_gradient[0], rtol=1e-6, atol=1e-6)
+    assert motion_of(pulls, evidence.state.rotations[0], evidence.state.translations[0]) is not None
+
+
+@pytest.mark.parametrize("known", [True, False])
+def test_a_camera_is_placed_by_known_points(known: bool):
+    given = session(cameras=2, frames=10)
+    truth = given.truth
+    assert truth.points is not None
+    lens, points = given.observations.cameras[1:2], truth.points.flatten(0, 1).mT
+    pixels = lens.project((truth.rotations[1] @ points + truth.translations[1][:, None]).mT[None])[0].mT
+    pixels[:, ::7] += 80.0
+    start = (truth.rotations[0], truth.translations[0]) if known else None
+    if start is not None:
+        start = se3.retract(truth.rotations[1], truth.translations[1], torch.full((6,), 0.01).double())
+    placed = resected(points, pixels, torch.ones(points.shape[1]).double(), lens, start)
+    assert placed is not None
+    assert placed.share == pytest.approx(6 / 7, abs=0.01)
+    torch.testing.assert_close(placed.translation, truth.translations[1], rtol=0, atol=1e-3)
+
+
+@pytest.mark.parametrize("cameras", [2, 5])
+def test_lengths_that_took_no_part_are_inside_their_intervals(cameras: int):
+    inside, frames = 0.0, 0
+    for seed in range(4):
+        acceptance = calibrate(session(cameras=cameras, seed=seed).observations).quality.acceptance
+        assert acceptance is not None
+        (errors,) = acceptance.lengths
+        inside, frames = inside + errors.inside * errors.frames, frames + errors.frames
+        assert abs(errors.mean_m) < 5 * errors.std_m
+        assert 0.2 < 1000 * acceptance.metre_m < 100
+        assert "A length of 1 m measured here is right to" in acceptance.sentence
+    assert 0.88 < inside / frames < 0.99
+
+
+def test_the_fitted_length_does_not_report_on_itself():
+    """A stick with a wrong end in some views has a wrong length, however well it was fitted."""
+    noisy = session(sigma_px=6.0)
+    acceptance = calibrate(noisy.observations).quality.acceptance
+    assert acceptance is not None
+    fitted = calibrate(noisy.observations).stick_lengths_m
+    assert acceptance.lengths[0].std_m > 3 * float(fitted[fitted.isfinite()].std())
+
+
+def test_a_quality_survives_files_and_processes(tmp_path: Path):
+    calibration = calibrate(knocked(session(cameras=3, frames=30), 1, 15, 2.0, 0.0))
+    quality = calibration.quality
+    assert Quality.from_json(json.loads(json.dumps(quality.as_json()))) == quality
+    calibration.save(tmp_path / "c.npz")
+    assert Calibration.load(tmp_path / "c.npz").quality == quality
+    for other in (copy.deepcopy(calibration), pickle.loads(pickle.dumps(calibration))):
+        assert other.quality == quality
+
+
+def test_a_family_of_findings_of_ones_own():
+    @findings("test_slow", "sessions of a low frame rate", replace=True)
+    def slow(evidence):
+        if evidence.observations.fps < 100:
+            yield Finding("low_frame_rate", Severity.CAUTION, "The frame rate is low.", "Record faster.")
+
+    try:
+        quality = calibrate(session(cameras=3, frames=30).observations).quality
+    finally:
+        FAMILIES._things.pop("test_slow")
+    assert quality.verdict is Verdict.USABLE
+    assert [finding.text for finding in quality.reasons] == ["The frame rate is low. Record faster."]
+
+
+class TestOldCalibration:
+    new = session(seed=1, frames=50)
+    old = calibrate(session(seed=1, frames=80, sigma_px=1.0).observations)
+
+    def test_cameras_that_did_not_move_are_good(self):
+        assert check(self.old, self.new.observations).verdict is Verdict.GOOD
+
+    @pytest.mark.parametrize(("camera", "turn_deg", "shift_m"), [(2, 0.3, 0.0), (4, 0.0, 0.03), (0, 0.5, 0.0), (1, 6.0, 0.2)])
+    def test_a_camera_that_moved_is_named_with_the_amount(self, camera: int, turn_deg: float, shift_m: float):
+        quality = check(self.old, knocked(self.new, camera, 0, turn_deg, shift_m))
+        (found,) = [finding for finding in quality.findings if finding.code == "camera_moved"]
+        assert found.cameras == (f"cam{camera + 1:02d}",)
+        assert not quality.verdict.acceptable
+        assert "before the recording" in found.meaning
+
+    def test_a_camera_that_moves_during_the_recording_is_dated(self):
+        quality = check(self.old, knocked(self.new, 3, 30, 1.0, 0.0))
+        found = quality.findings[0]
+        assert found.cameras == ("cam04",)
+        assert found.frames is not None
+        assert abs(found.frames[0] - 30) <= 2
+
+    def test_another_number_of_cameras_is_refused(self):
+        with pytest.raises(ObservationError, match="number of cameras"):
+            check(self.old, self.new.observations.of_cameras([0, 1, 2]))
+
+
+def test_a_camera_that_moved_can_be_split():
+    given = session()
+    calibration = calibrate(knocked(given, 2, 30, 3.0, 0.0).with_camera_split(2, 30))
+    assert calibration.quality.verdict is Verdict.GOOD
+    assert calibration.camera_names[-1] == "cam03 from frame 30"
+    turned = calibration.rotations[5] @ calibration.rotations[2].mT
+    assert float(torch.arccos((turned.diagonal().sum() - 1) / 2).rad2deg()) == pytest.approx(3.0, abs=0.3)
+    with pytest.raises(ObservationError, match="cannot be split"):
+        given.observations.with_camera_split(2, 0)
+
+
+def test_command_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    given = session()
+    write_npz(tmp_path / "good.npz", given.observations, given.truth)
+    write_npz(tmp_path / "moved.npz", knocked(given, 1, 0, 1.0, 0.0), given.truth)
+    write_npz(tmp_path / "during.npz", knocked(given, 1, 30, 1.0, 0.0), given.truth)
+    good, moved, during = (str(tmp_path / f"{name}.npz") for name in ("good", "moved", "during"))
+    out = str(tmp_path / "out")
+    assert main(["calibrate", good, "--out", out]) == 0
+    assert capsys.readouterr().out.startswith("verdict: good (nothing speaks against the result)\nA length of 1 m")
+    assert json.loads((tmp_path / "out" / "report.json").read_text())["quality"]["verdict"] == "good"
+    assert main(["check", out, good]) == 0
+    assert main(["check", out, moved, "--json", str(tmp_path / "check.json")]) == 3
+    assert json.loads((tmp_path / "check.json").read_text())["findings"][0]["cameras"] == ["cam02"]
+    assert main(["check", str(tmp_path / "out" / "calibration.toml"), moved]) == 3
+    capsys.readouterr()
+    assert main(["calibrate", during, "--out", out, "--refine", "none"]) == 3
+    assert "verdict: poor" in capsys.readouterr().out
+    assert main(["calibrate", during, "--out", out, "--refine", "none", "--split-moved"]) == 0
+    assert "cam02 from frame 30" in capsys.readouterr().out
+    assert main(["evaluate", str(tmp_path / "out" / "calibration.toml"), good]) == 2
+    assert main(["calibrate", good, "--out", out]) == 0
+    capsys.readouterr()
+    assert main(["evaluate", out, good]) == 0
+    assert "aligned before the comparison: all 5 camera centres" in capsys.readouterr().out
