@@ -142,8 +142,8 @@ def camera_table(cameras: Sequence[CameraFacts]) -> Table:
     columns = (
         Column("camera", is_text=True),
         Column("position x, y, z", "m", "centre of the camera in the frame of the calibration"),
-        Column("its std", "mm", "standard deviation of that position; the first camera is the world"),
-        Column("rotation std", "deg", "standard deviation of the camera's rotation"),
+        Column("its std", "mm", "standard deviation of that position, relative to the first camera"),
+        Column("rotation std", "deg", "standard deviation of the camera's rotation, relative to the first camera"),
         Column("reprojection", "px, median", "distance between a keypoint and the projection of its point"),
         Column("keypoints used", "", "keypoints that agree with the other cameras"),
         Column("of those seen", "", "the rest contradicts the other cameras and was set aside"),

@@ -307,7 +307,7 @@ def _card(calibration: Calibration, data: Mapping[str, Any], camera: int, own: C
         ("Keypoints used", f"{own.used} ({share(own.used / own.seen) if own.seen else '-'})"),
         ("Image covered", share(image["covered"])),
         ("Reprojection", f"{digits(own.median_px)} px median, {digits(own.rms_px)} px rms"),
-        ("Position, rotation", "the world" if camera == 0 and own.std_m == 0 else place),
+        ("Position, rotation", "the reference" if camera == 0 and own.std_m == 0 else place),
         *_checks(calibration, camera),
     ]
     other = int(calibration.other_person[camera].sum())

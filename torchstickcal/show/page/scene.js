@@ -48,7 +48,7 @@ function view(width, height) {
   const away = sum(scaled(level, Math.cos(pitch)), up, -Math.sin(pitch));
   const y = sum(scaled(up, Math.cos(pitch)), level, Math.sin(pitch));
   const eye = scaled(away, -distance * scene.radius);
-  return { x, y, away, eye, focal: 0.98 * Math.min(width, 1.35 * height) };
+  return { x, y, away, eye, focal: Math.min(0.9 * width, 1.3 * height) };
 }
 
 function drawScene(frame) {
