@@ -17,8 +17,8 @@ from torchstickcal.model.measurements import Measurements
 from torchstickcal.model.state import State
 from torchstickcal.model.unknowns import REFINEMENTS
 from torchstickcal.observations import Observations
-from torchstickcal.registry import Registry
 from torchstickcal.quality.registry import FAMILIES
+from torchstickcal.registry import Registry
 from torchstickcal.simulate import SPORTS, Noise, golf_session
 
 _DATA = Path(os.environ.get("TORCHSTICKCAL_DATA", Path(__file__).parents[2] / "shared" / "data"))
