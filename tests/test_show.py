@@ -79,6 +79,23 @@ def test_plots_of_what_is_not_there(calibration: Calibration):
     ]
 
 
+@pytest.mark.parametrize("what", ["no athlete", "one frame", "nothing"])
+def test_figures_of_little(calibration: Calibration, what: str):
+    if what == "no athlete":
+        found = calibrate(OBSERVATIONS, "stick_only")
+    elif what == "one frame":
+        found = calibrate(replace(OBSERVATIONS, keypoints=OBSERVATIONS.keypoints[:, :1]))
+    else:
+        nothing = {
+            name: torch.full_like(getattr(calibration, name), torch.nan)
+            for name in ("points", "residuals_px", "stick_lengths_m")
+        }
+        found = replace(calibration, **nothing, inliers=calibration.inliers & False, judgement=calibration.quality)
+    for figure in (found.plot(), found.plot_residuals(), found.plot_stick()):
+        figure.canvas.draw()
+    assert found.quality.verdict in page.report_page(found)
+
+
 def test_a_calibration_in_one_line_and_as_html(calibration: Calibration):
     line = repr(calibration)
     assert "\n" not in line

@@ -68,20 +68,10 @@ def write_results(calibration: Calibration, folder: Path, writers: dict[str, Wri
 def versions() -> dict[str, str]:
     """The versions of what calculates."""
     import platform
+    from importlib.metadata import version
 
-    import kornia
-    import numpy as np
-    import torch
-
-    import torchstickcal
-
-    return {
-        "torchstickcal": torchstickcal.__version__,
-        "torch": torch.__version__,
-        "kornia": kornia.__version__,
-        "numpy": np.__version__,
-        "python": platform.python_version(),
-    }
+    packages = ("torchstickcal", "torch", "kornia", "numpy")
+    return {name: version(name) for name in packages} | {"python": platform.python_version()}
 
 
 def show_results(

@@ -61,7 +61,7 @@ def _accepted(acceptance: Acceptance) -> list[str]:
     known = [px for px in acceptance.left_out_px if px == px]
     if known:
         lines.append(f"each camera predicted by the others: {', '.join(f'{px:.2f}' for px in acceptance.left_out_px)} px")
-    return lines
+    return [part for line in lines for part in textwrap.wrap(line, _WIDTH, subsequent_indent="  ", break_long_words=False)]
 
 
 def _wrong(count: int) -> str:

@@ -86,8 +86,9 @@ def _draw_sticks(axes: Axes3D, calibration: Calibration, points: NDArray[np.floa
 def _draw_athlete(axes: Axes3D, calibration: Calibration, points: NDArray[np.float64]) -> None:
     """Draw the points (P, 3) of one frame, and the bones between those with known names."""
     bones = points[np.array(bones_of(calibration.point_names), dtype=int).reshape(-1, 2)]
-    if len(bones):
-        axes.add_collection3d(Line3DCollection(bones[np.isfinite(bones).all((1, 2))], colors=_BODY, linewidths=1.8))
+    known = bones[np.isfinite(bones).all((1, 2))]
+    if len(known):
+        axes.add_collection3d(Line3DCollection(known, colors=_BODY, linewidths=1.8))
     axes.scatter(*points.T, color=_BODY, s=8, depthshade=False)
 
 

@@ -39,5 +39,7 @@ def frusta(calibration: Calibration) -> Tensor:
 def without_extremes(points: NDArray[np.float64]) -> NDArray[np.float64]:
     """The points between the 2nd and 98th percentile of each coordinate. Wrongly triangulated points can be far away."""
     known = points[np.isfinite(points).all(1)]
+    if not len(known):
+        return known
     low, high = np.percentile(known, [2, 98], axis=0)
     return known[((known >= low) & (known <= high)).all(1)]
