@@ -23,7 +23,7 @@ from torchstickcal.observations import Observations
 from torchstickcal.pipeline.initialise import triangulated
 from torchstickcal.quality.finding import Finding, Severity
 from torchstickcal.quality.linear import FramePulls
-from torchstickcal.quality.moved import LEAST_EVIDENCE, motion_of
+from torchstickcal.quality.moved import motion_of
 from torchstickcal.quality.resection import resected
 from torchstickcal.quality.verdict import Quality
 from torchstickcal.result import Calibration
@@ -32,6 +32,8 @@ from torchstickcal.workers import on_worker
 _MOST_FRAMES = 240
 """Frames that are looked at, evenly spaced."""
 _REJECT_SIGMAS = 6.0
+_LEAST_EVIDENCE = 45.0
+"""Squared length of a change in its standard deviations, from which on a camera has moved."""
 _PRIOR_M, _PRIOR_RAD = 0.3, 0.2
 _HARMLESS_DEG, _HARMLESS_M = 0.05, 0.003
 """A change that no lab would calibrate again for."""
@@ -184,7 +186,7 @@ def _checked(old: OldRig, observations: Observations) -> Quality:
         doubtful = [camera for camera in left if float(rig.shares[camera]) < _LEAST_AGREEING]
         camera = max(doubtful or left, key=lambda one: rig.evidence(one, exact=True))
         strength = rig.evidence(camera)
-        if strength < LEAST_EVIDENCE and not doubtful:
+        if strength < _LEAST_EVIDENCE and not doubtful:
             break
         rig.place_again(camera)
         found.append(_change(rig, observations, camera, strength))
@@ -227,7 +229,7 @@ def _step_within(rig: _Rig) -> tuple[int, int, float] | None:
         if before - after > _LOST_SHARE and 0 < place < m.frames:
             return camera, place, torch.inf
     since = motion_of(rig.pulls, rig.rotations, rig.translations)
-    if since is None or since.evidence < LEAST_EVIDENCE or since.gradual:
+    if since is None or since.evidence < _LEAST_EVIDENCE or since.gradual:
         return None
     return since.camera, since.frame, since.evidence
 
@@ -250,7 +252,7 @@ def _change(rig: _Rig, observations: Observations, camera: int, strength: float,
         cameras=(name,),
         frames=(frame, observations.num_frames - 1),
         figure=strength**0.5,
-        limit=LEAST_EVIDENCE**0.5,
+        limit=_LEAST_EVIDENCE**0.5,
         unit="standard deviations",
         is_cause=True,
     )

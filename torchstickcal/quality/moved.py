@@ -16,7 +16,7 @@ from torch import Tensor
 from torchstickcal.geometry import se3
 from torchstickcal.quality.linear import FramePulls
 
-LEAST_EVIDENCE = 45.0
+LEAST_EVIDENCE = 32.0
 """Squared length of the change in its standard deviations, from which on a camera is said to have moved: 6 numbers are fitted
 at the best of many frames and cameras. Measured on sound sessions, see docs/quality.md."""
 _PRIOR_M, _PRIOR_RAD = 0.03, 0.02

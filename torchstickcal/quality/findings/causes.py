@@ -21,9 +21,9 @@ _ALIEN_SHARE = 0.75
 _FARTHEST_DEG, _FARTHEST_SHARE = 45.0, 0.3
 """Largest change of a camera that is a motion of it, the shift as a share of the rig; beyond, it shows something else."""
 _MOST_SUSPECTS = 4
-_BEHIND_OTHERS = 0.8
+_BEHIND_OTHERS = 0.75
 _SUSPECT_SHARE = 0.8
-_NOISE_RATIO = 0.6
+_NOISE_RATIO, _NOISY_MRAD = 0.6, 8.0
 
 
 @findings("causes", "why a camera contradicts the others, by trial", tries=True)
@@ -44,8 +44,8 @@ def causes(evidence: Evidence) -> Iterator[Finding]:
         return
     _, camera, rest = best
     worse = float(agreement[camera]) < _BEHIND_OTHERS * rest.share
-    better = worse or rest.noise_mrad < _NOISE_RATIO * evidence.noise_mrad
-    if rest.share < _SOUND_SHARE or not better:
+    noisy = evidence.noise_mrad > _NOISY_MRAD and rest.noise_mrad < _NOISE_RATIO * evidence.noise_mrad
+    if rest.share < _SOUND_SHARE or not (worse or noisy):
         return
     if (finding := _explained(evidence, camera, rest)) is not None:
         yield finding
