@@ -125,6 +125,13 @@ def test_tables_explain_themselves_and_stay_aligned(calibration: Calibration):
     assert [int(row[5]) for row in camera_table(camera_facts(calibration)).rows] == used
 
 
+def test_an_unknown_of_a_module_that_is_not_imported_is_shown(calibration: Calibration):
+    own = replace(calibration.unknowns["focal"], label="aspect ratio", unit="")
+    with_own = replace(calibration, unknowns={**calibration.unknowns, "aspect": own}, judgement=calibration.quality)
+    assert "Aspect ratio" in table(with_own)
+    assert "Aspect ratio" in page.report_page(with_own)
+
+
 def test_no_text_breaks_a_table():
     rows = (("a\nb", "1"), ("<x>\x1b[31m", "22"))
     made = Table("T & t", (Column("name", is_text=True), Column("n", "mm", "how 'many'")), rows)

@@ -168,7 +168,8 @@ def unknown_tables(calibration: Calibration, only_refined: bool = False) -> list
     tables = []
     for name, parameter in calibration.unknowns.items():
         known = bool(parameter.by_component("suggested").isfinite().any())
-        noticeable = all_unknowns()[name].noticeable_prior_share is not None
+        unknown = all_unknowns().get(name)
+        noticeable = unknown is None or unknown.noticeable_prior_share is not None  # None: of a module that is not imported
         if known and (parameter.refined or (noticeable and not only_refined)):
             tables.append(_unknown_table(calibration, parameter))
     return tables
