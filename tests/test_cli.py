@@ -37,9 +37,9 @@ def test_calibrate_then_evaluate(session: Path, tmp_path: Path, capsys: pytest.C
     out = tmp_path / "results"
     assert main(["calibrate", str(session), "--out", str(out)]) == 0
     shown = capsys.readouterr().out
-    for word in ("cam01", "centre", "reprojection", "keypoints", "club_grip - club_head", "initialise", "total"):
+    for word in ("verdict: good", "cam01", "position", "reprojection", "keypoints", "club_grip - club_head", "report.html"):
         assert word in shown
-    assert sorted(file.name for file in out.iterdir()) == ["calibration.toml", "points.npz", "report.json"]
+    assert sorted(file.name for file in out.iterdir()) == ["calibration.toml", "points.npz", "report.html", "report.json"]
     report = json.loads((out / "report.json").read_text())
     assert report["converged"] is True
     assert [camera["name"] for camera in report["cameras"]] == ["cam01", "cam02", "cam03"]

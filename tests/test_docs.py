@@ -52,7 +52,7 @@ def modules() -> list[str]:
 
 
 @pytest.mark.parametrize("module", modules())
-def test_examples_of_a_module_run(module: str):
+def test_examples_of_a_module_run(module: str, own_parts: object):
     results = doctest.testmod(importlib.import_module(module.removesuffix(".__init__")))
     assert results.attempted
     assert not results.failed

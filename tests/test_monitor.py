@@ -78,6 +78,7 @@ def test_log_has_the_result(logged: tuple[Calibration, EventAccumulator]):
     assert {"results/text_summary", "warnings/text_summary", "scene_VERTEX", "scene_FACE", "scene_COLOR"} <= set(
         tags["tensors"]
     )
+    assert b"verdict: good" in log.Tensors("results/text_summary")[0].tensor_proto.string_val[0]
     assert b"right/far" in log.Tensors("results/text_summary")[0].tensor_proto.string_val[0]
     warnings = log.Tensors("warnings/text_summary")[0].tensor_proto.string_val[0].decode()
     assert warnings == f"converged\n\n- {calibration.warnings[0]}"

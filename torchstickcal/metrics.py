@@ -80,19 +80,10 @@ def pose_errors(
     )
     centres, true_centres = se3.camera_centres(r, t), se3.camera_centres(r_true, t_true)
     by_first = r_true[..., 0, :, :].mT @ r[..., 0, :, :]
-    scale, cameras = centres.new_ones(()), r_true.shape[-3]
-    aligned_by = "nothing"
+    scale = centres.new_ones(())
     if alignment in ("rigid", "similarity"):
-        spread = torch.linalg.svdvals((true_centres - true_centres.mean(-2, keepdim=True)).detach())
-        collinear = (spread[..., 1] <= _COLLINEAR * spread[..., 0])[..., None, None]
+        collinear = _collinear(true_centres)[..., None, None]
         by_centres, _ = align(centres, true_centres)
-        by = (
-            "pose of the first camera (the centres lie on one line)"
-            if bool(collinear.all())
-            else f"all {cameras} camera centres"
-        )
-        freely = "and translation, no scale" if alignment == "rigid" else ", translation and scale"
-        aligned_by = f"{by}, rotation {freely}".replace(" ,", ",")
         rotation = by_first.where(collinear, by_centres)
         moved = centres @ rotation.mT
         if alignment == "similarity":
@@ -101,7 +92,7 @@ def pose_errors(
         at_first = true_centres[..., 0, :] - scale[..., None] * moved[..., 0, :]
         offset = at_first.where(collinear[..., 0], true_centres.mean(-2) - scale[..., None] * moved.mean(-2))
     elif alignment == "first_camera":
-        rotation, aligned_by = by_first, "pose of the first camera, rotation and translation, no scale"
+        rotation = by_first
         offset = true_centres[..., 0, :] - (rotation @ centres[..., 0, :, None])[..., 0]
     elif alignment == "none":
         rotation, offset = torch.eye(3).to(r), r.new_zeros(3)
@@ -112,8 +103,26 @@ def pose_errors(
     return PoseErrors(
         rotation_deg=rotation_angle(r_true @ rotation[..., None, :, :] @ r.mT).rad2deg(),
         translation_m=(laid - true_centres).norm(dim=-1),
-        aligned_by=aligned_by,
+        aligned_by=_aligned_by(alignment, true_centres),
     )
+
+
+def _aligned_by(alignment: Alignment, true_centres: Tensor) -> str:
+    """What was laid onto the truth, in words."""
+    scale = "and scale" if alignment == "similarity" else "no scale"
+    if alignment == "none":
+        return "nothing: the worlds are the same"
+    if alignment == "first_camera":
+        return "pose of the first camera, rotation and translation, no scale"
+    if bool(_collinear(true_centres).all()):
+        return f"pose of the first camera, rotation and translation, {scale} (the camera centres lie on one line)"
+    return f"all {true_centres.shape[-2]} camera centres, rotation and translation, {scale}"
+
+
+def _collinear(centres: Tensor) -> Tensor:
+    """Whether camera centres (..., C, 3) lie on one line, (...)."""
+    spread = torch.linalg.svdvals((centres - centres.mean(-2, keepdim=True)).detach())
+    return spread[..., 1] <= _COLLINEAR * spread[..., 0]
 
 
 class PoseErrorMetric:

@@ -7,7 +7,7 @@ import json
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
@@ -20,12 +20,16 @@ from torchstickcal.geometry import se3
 from torchstickcal.geometry.cameras import Intrinsics
 from torchstickcal.lazy import cached_property
 from torchstickcal.quality.verdict import Quality
+from torchstickcal.registry import Registry
 from torchstickcal.shapes import check_shapes
 from torchstickcal.solvers import IterationRecord, StageRecord, Stop
 from torchstickcal.solvers.uncertainty import centre_covariances, point_covariances, relative_scale_std
 from torchstickcal.stick import Stick
 from torchstickcal.untrusted import open_arrays, reading
 from torchstickcal.world import WORLDS, Frame, World, athlete_frame, floor_frame
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 _FORMAT = "torchstickcal calibration 8"
 _TENSORS = {
@@ -87,7 +91,11 @@ _UNKNOWN = "unknown_"
 _PARAMETER_TENSORS = ("value", "std", "given", "prior_std", "suggested", "suggested_std")
 
 
-@dataclass(frozen=True, eq=False)
+VIEWS: Registry[Callable[..., Any]] = Registry("view of a calibration", "torchstickcal.show.views")
+"""Functions that show a calibration, by name; the methods of :class:`Calibration` ask them."""
+
+
+@dataclass(frozen=True, eq=False, repr=False)
 class Calibration:
     """A calibrated rig and the scene it saw, in metres, in the frame of the first camera unless :attr:`world` says another.
 
@@ -105,6 +113,8 @@ class Calibration:
         (False, True)
         >>> bool((calibration.camera_std_m[1:] < 0.05).all())
         True
+        >>> calibration.summary()["quality"]["verdict"]
+        'good'
     """
 
     rotations: Tensor
@@ -340,6 +350,48 @@ class Calibration:
 
     def _inlier_distances(self) -> Tensor:
         return self.residuals_px.norm(dim=-1).where(self.inliers, torch.nan).flatten(1)
+
+    def plot(self, frame: int | None = None) -> Figure:
+        """A 3D figure of cameras, athlete and stick, in the axes of the calibration.
+
+        Args:
+            frame: the common frame in which the athlete is drawn; None for the one with the most known points.
+
+        Returns:
+            A figure of matplotlib; notebooks show it, ``figure.savefig("rig.png")`` writes it.
+
+        Raises:
+            ObservationError: if there is no such frame.
+        """
+        if frame is not None:
+            last = len(self.points) - 1
+            frame = int(
+                number_of(frame, "frame", what="no such frame", expected=f"a number from 0 to {last}", least=0, most=last)
+            )
+        return VIEWS["rig"](self, frame)
+
+    def plot_residuals(self) -> Figure:
+        """A figure of the residuals of each camera along x and y, and of their size over the frames."""
+        return VIEWS["residuals"](self)
+
+    def plot_stick(self) -> Figure:
+        """A figure of the reconstructed length of each stick over time, minus the given one."""
+        return VIEWS["stick"](self)
+
+    def summary(self) -> dict[str, Any]:
+        """The calibration without its arrays, as JSON can hold it: the content of ``report.json``.
+
+        Lengths are in metres, angles in degrees, times in seconds; None where a number is not known.
+        """
+        return VIEWS["summary"](self)
+
+    def __repr__(self) -> str:
+        """One line with the verdict."""
+        return VIEWS["text"](self)
+
+    def _repr_html_(self) -> str:
+        """What notebooks show: the verdict with its reasons, and a table of the cameras."""
+        return VIEWS["html"](self)
 
     def save(self, path: str | Path) -> None:
         """Write everything to one ``.npz`` file."""

@@ -24,6 +24,7 @@ from torch import Tensor
 
 from torchstickcal import Calibration, CalibrationError
 from torchstickcal.io import read_camera_toml, write_camera_toml
+from torchstickcal.show.page.page import report_page
 from torchstickcal.show.report import summary, table
 
 LARGE = os.environ.get("TORCHSTICKCAL_FUZZ") == "large"
@@ -134,6 +135,8 @@ def check_calibration(calibration: Calibration) -> None:
             assert torch.equal(rig.translations, calibration.translations.double())
     assert table(calibration)
     json.dumps(summary(calibration), allow_nan=False)
+    assert calibration.quality.verdict in report_page(calibration)
+    assert calibration._repr_html_()
 
 
 def _check_converged(calibration: Calibration) -> None:

@@ -17,6 +17,7 @@ from torchstickcal.cli.evaluate import evaluate
 from torchstickcal.cli.info import info
 from torchstickcal.cli.listing import LISTS, list_names
 from torchstickcal.cli.outputs import EXIT_UNUSABLE
+from torchstickcal.cli.report import report
 from torchstickcal.cli.sample import sample
 from torchstickcal.cli.simulate import demo, simulate
 from torchstickcal.cli.triangulate import triangulate_session
@@ -58,6 +59,7 @@ def parser() -> argparse.ArgumentParser:
     for add in (
         _add_calibrate,
         _add_calibrate_many,
+        _add_report,
         _add_check,
         _add_triangulate,
         add_detect,
@@ -96,8 +98,19 @@ def _add_calibrate(commands: Any) -> None:
         "--split-moved", action="store_true", help="if a camera moved, calibrate again with its places before and after as two"
     )
     _add_strict(command)
+    command.add_argument("--verbose", action="store_true", help="show every table: lenses, clocks, sticks, points, stages")
     _add_plugin(command)
     command.set_defaults(run=calibrate_session)
+
+
+def _add_report(commands: Any) -> None:
+    command = commands.add_parser(
+        "report",
+        help="write report.html for results that `calibrate` wrote",
+        description="Write report.html, a page that shows the result, into a folder that `calibrate` wrote.",
+    )
+    command.add_argument("folder", metavar="DIR", type=_path, help="folder that `calibrate` wrote")
+    command.set_defaults(run=report, plugin=())
 
 
 def _add_check(commands: Any) -> None:

@@ -46,8 +46,8 @@ def calibrate_session(options: argparse.Namespace) -> int:
     for sentence in sentences:
         print(f"note: {sentence}", file=sys.stderr)
     with atomic_set(options.out) as folder:
-        write_results(calibration, folder, writers, _provenance(options, [*session.notes, *sentences]))
-    return show_results(calibration, options.out, writers, options.strict)
+        write_results(calibration, folder, writers, _provenance(options, config, [*session.notes, *sentences]))
+    return show_results(calibration, options.out, writers, options.strict, options.verbose)
 
 
 def _split(observations: Observations, calibration: Calibration) -> Observations | None:
@@ -102,10 +102,14 @@ def _metres(text: str) -> float:
         ) from error
 
 
-def _provenance(options: argparse.Namespace, notes: Sequence[str]) -> dict[str, Any]:
+def _provenance(options: argparse.Namespace, config: Config, notes: Sequence[str]) -> dict[str, Any]:
+    """What the results are made of, as JSON can hold it."""
+    from dataclasses import asdict
+
     return {
         "session": ", ".join(map(str, options.session)),
         "config": options.config,
+        "configuration": asdict(config),
         **({"notes": list(notes)} if notes else {}),
     }
 

@@ -66,7 +66,7 @@ def _found(observations: Observations) -> dict[str, Any]:
 
 def _table(found: dict[str, Any]) -> str:
     """The same as a text to print."""
-    from torchstickcal.show.report import aligned, printable
+    from torchstickcal.show.tables import printable, text_table
 
     names = [camera["name"] for camera in found["cameras"]]
     rate = "unknown frame rate" if found["fps"] is None else f"{found['fps']:g} frames per second"
@@ -76,16 +76,16 @@ def _table(found: dict[str, Any]) -> str:
     for camera in found["cameras"]:
         size = "-" if camera["image_size"] is None else "x".join(f"{side:g}" for side in camera["image_size"])
         rows.append([printable(camera["name"]), size, str(camera["frames"]), str(camera["keypoints"])])
-    text += [aligned(rows), ""]
+    text += [text_table(rows), ""]
     rows = [["point, seen in % of the frames by", *map(printable, names)]]
     for point in found["points"]:
         rows.append([printable(point["name"]), *(f"{100 * point['seen'][name]:.0f}" for name in names)])
-    text += [aligned(rows), ""]
+    text += [text_table(rows), ""]
     rows = [["keypoints in common", "number", ""]]
     for pair in sorted(found["pairs"], key=lambda pair: -pair["keypoints"]):
         remark = "" if pair["keypoints"] >= _FEW else "too few to place one by the other"
         rows.append([" - ".join(map(printable, pair["cameras"])), str(pair["keypoints"]), remark])
-    text += [aligned(rows), "", f"{found['triangulated']:.0%} of the points are seen by two cameras or more."]
+    text += [text_table(rows), "", f"{found['triangulated']:.0%} of the points are seen by two cameras or more."]
     for stick in found["sticks"]:
         ends = f"{printable(stick['start'])} - {printable(stick['end'])}"
         text.append(f"Stick {ends}, {stick['length_m']:g} m: both ends are seen by two cameras in {stick['frames']} frames.")

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 EXIT_DONE, EXIT_NOT_CONVERGED, EXIT_UNUSABLE, EXIT_POOR, EXIT_INTERRUPTED = 0, 1, 2, 3, 130
 CAMERAS_FORMAT = "pose2sim"
-CAMERAS_FILE, POINTS_FILE, REPORT_FILE = "calibration.toml", "points.npz", "report.json"
+CAMERAS_FILE, POINTS_FILE, REPORT_FILE, PAGE_FILE = "calibration.toml", "points.npz", "report.json", "report.html"
 
 
 def chosen_writers(names: str | None = None) -> dict[str, Writer]:
@@ -31,7 +31,9 @@ def chosen_writers(names: str | None = None) -> dict[str, Writer]:
     Raises:
         CalibrationError: for an unknown format, or if two files have the same name.
     """
-    return _distinct(dict.fromkeys([CAMERAS_FORMAT, *(names.split(",") if names else ())]), {POINTS_FILE, REPORT_FILE})
+    return _distinct(
+        dict.fromkeys([CAMERAS_FORMAT, *(names.split(",") if names else ())]), {POINTS_FILE, REPORT_FILE, PAGE_FILE}
+    )
 
 
 def point_writers(names: str | None) -> dict[str, Writer]:
@@ -96,25 +98,58 @@ def check_frame_rate(writers: dict[str, Writer], observations: Observations) -> 
 
 def result_names(writers: dict[str, Writer]) -> list[str]:
     """The names of the single files that :func:`write_results` writes; folders of several files are not among them."""
-    return [*(name for name, writer in writers.items() if not writer.files), POINTS_FILE, REPORT_FILE]
+    return [*(name for name, writer in writers.items() if not writer.files), POINTS_FILE, REPORT_FILE, PAGE_FILE]
 
 
 def write_results(calibration: Calibration, folder: Path, writers: dict[str, Writer], provenance: dict[str, Any]) -> None:
-    """Write the results of a calibration into a folder of :func:`torchstickcal.files.atomic_set`."""
-    from torchstickcal.show.report import summary
+    """Write the results of a calibration into a folder of :func:`torchstickcal.files.atomic_set`.
 
+    Args:
+        calibration: what was found.
+        folder: where.
+        writers: of the camera file and of further formats, by the names of their files.
+        provenance: the session, the configuration and notes, as JSON can hold them.
+    """
+    from torchstickcal.show.page.page import report_page
+
+    made_of = provenance | {"versions": versions()}
     for file_name, writer in writers.items():
         writer.write(folder / file_name, calibration)
     calibration.save(folder / POINTS_FILE)
-    write_json(folder / REPORT_FILE, provenance | summary(calibration))
+    write_json(folder / REPORT_FILE, made_of | calibration.summary())
+    (folder / PAGE_FILE).write_text(report_page(calibration, made_of), "utf-8")
 
 
-def show_results(calibration: Calibration, folder: Path, writers: dict[str, Writer], strict: bool = False) -> int:
+def versions() -> dict[str, str]:
+    """The versions of what calculates."""
+    import platform
+    from importlib.metadata import version
+
+    packages = ("torchstickcal", "torch", "kornia", "numpy")
+    return {name: version(name) for name in packages} | {"python": platform.python_version()}
+
+
+def show_results(
+    calibration: Calibration, folder: Path, writers: dict[str, Writer], strict: bool = False, verbose: bool = False
+) -> int:
+    """Show a calibration: the verdict first, then the tables, and where the files are.
+
+    Args:
+        calibration: what was found.
+        folder: where its files are.
+        writers: that wrote them.
+        strict: whether ``usable`` counts as poor.
+        verbose: whether every table is shown.
+
+    Returns:
+        The exit status.
+    """
     from torchstickcal.show.report import table
 
     show_quality(calibration.quality)
-    print(f"\n{table(calibration)}")
-    print(f"\n{', '.join([*writers, POINTS_FILE, REPORT_FILE])} in {folder}")
+    print(f"\n{table(calibration, verbose)}")
+    print(f"\n{', '.join([*writers, POINTS_FILE, REPORT_FILE, PAGE_FILE])} in {folder}")
+    print(f"Open {folder / PAGE_FILE} in a browser to see the result." + ("" if verbose else " More tables: --verbose."))
     if not calibration.converged:
         print(f"not converged: {calibration.status}", file=sys.stderr)
         return EXIT_NOT_CONVERGED
@@ -150,7 +185,7 @@ def errors_by_camera(names: Sequence[str], errors: PoseErrors) -> dict[str, Any]
 
 
 def print_errors(errors: dict[str, Any]) -> None:
-    from torchstickcal.show.report import printable
+    from torchstickcal.show.tables import printable
 
     width = max(6, *(len(printable(camera["name"])) for camera in errors["cameras"]))
     print(f"aligned before the comparison: {errors['aligned_by']}")

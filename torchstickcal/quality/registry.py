@@ -50,12 +50,12 @@ def findings(
     Raises:
         ConfigError: if the name is taken, or what is decorated is no function.
 
-    Example:
-        >>> from torchstickcal.quality.finding import Finding, Severity
-        >>> @findings("slow", "sessions of a low frame rate")
-        ... def slow(evidence):
-        ...     if (evidence.observations.fps or 100) < 5:
-        ...         yield Finding("low_frame_rate", Severity.CAUTION, "The frame rate is low.")
+    Example::
+
+        @findings("slow", "sessions of a low frame rate")
+        def slow(evidence):
+            if (evidence.observations.fps or 100) < 25:
+                yield Finding("low_frame_rate", Severity.CAUTION, "The frame rate is low.")
     """
 
     def register(look: Look) -> Look:

@@ -13,8 +13,10 @@ from matplotlib.figure import Figure
 from torch import Tensor
 
 from torchstickcal.result import Calibration
+from torchstickcal.show.look import COLOURS, camera_colour
+from torchstickcal.show.tables import printable
 
-_INLIER_COLOUR, _OUTLIER_COLOUR, _REPROJECTION_COLOUR = "#1f5fa8", "#d1495b", "#e8a400"
+_USED, _ASIDE, _REPROJECTION = (COLOURS[name].light for name in ("used", "aside", "reprojection"))
 _MOST_POINTS = 1000
 _MOST_COLUMNS = 5
 _LEAST_LIMIT_PX = 0.01
@@ -27,7 +29,7 @@ _SPREAD = 0.99
 def residuals_figure(calibration: Calibration) -> Figure:
     """The residuals of each camera along x and y, and their size over the frames."""
     residuals, inliers = calibration.residuals_px.detach().double().cpu(), calibration.inliers.cpu()
-    names = calibration.camera_names
+    names = [printable(name) for name in calibration.camera_names]
     rows, columns = _grid(len(names))
     height = 2.6 * (rows + 1)
     figure = Figure(figsize=(2.7 * columns + 0.4, height))
@@ -37,13 +39,13 @@ def residuals_figure(calibration: Calibration) -> Figure:
     limit = _limit(residuals[inliers])
     for camera, name in enumerate(names):
         axes = figure.add_subplot(grid[camera // columns, camera % columns])
-        for chosen, colour, label in ((~inliers, _OUTLIER_COLOUR, "outlier"), (inliers, _INLIER_COLOUR, "inlier")):
+        for chosen, colour, label in ((~inliers, _ASIDE, "set aside"), (inliers, _USED, "used")):
             found = residuals[camera][chosen[camera] & residuals[camera].isfinite().all(-1)]
             x, y = found[:: 1 + len(found) // _MOST_POINTS].unbind(1)
             axes.plot(x.numpy(), y.numpy(), ".", markersize=3, alpha=0.4, color=colour, markeredgewidth=0, label=label)
         axes.set(xlim=(-limit, limit), ylim=(limit, -limit), aspect="equal")
         unused = int((~inliers & residuals.isfinite().all(-1))[camera].sum())
-        axes.set_title(f"{name}: {int(inliers[camera].sum())} used, {unused} not", fontsize=8)
+        axes.set_title(f"{name}: {int(inliers[camera].sum())} used, {unused} set aside", fontsize=8)
         axes.tick_params(labelsize=7)
         axes.locator_params(nbins=5)
         axes.set_xlabel("x (px)" if camera >= len(names) - columns else "", fontsize=8)
@@ -52,8 +54,8 @@ def residuals_figure(calibration: Calibration) -> Figure:
             axes.legend(loc="upper right", fontsize=7, markerscale=3)
     over_time = figure.add_subplot(grid[rows, :])
     sizes = residuals.norm(dim=-1).where(inliers, torch.nan).nanmedian(dim=2).values
-    for name, size in zip(names, sizes.numpy(), strict=True):
-        over_time.plot(size, linewidth=0.9, label=name)
+    for number, (name, size) in enumerate(zip(names, sizes.numpy(), strict=True)):
+        over_time.plot(size, linewidth=0.9, label=name, color=camera_colour(number).light)
     over_time.set_ylim(0, 1.35 * float(sizes.nan_to_num().max()) or 1.0)
     over_time.set_xlabel("frame", fontsize=8)
     over_time.set_ylabel("residual (px)", fontsize=8)
@@ -117,12 +119,10 @@ def _draw_keypoints(axes: Axes, keypoints: Tensor, reprojections: Tensor, inlier
     found, used = reprojections.numpy(), inliers.numpy()
     given = keypoints.numpy()
     pairs = np.stack([given, found], axis=1)
-    axes.add_collection(
-        LineCollection(list(pairs[np.isfinite(pairs).all((1, 2))]), colors=_REPROJECTION_COLOUR, linewidths=0.8)
-    )
-    axes.scatter(*given[used].T, s=12, color=_INLIER_COLOUR, linewidths=0, label="keypoint, used")
-    axes.scatter(*given[~used].T, s=18, color=_OUTLIER_COLOUR, marker="x", linewidths=1, label="keypoint, not used")
-    axes.scatter(*found.T, s=22, facecolors="none", edgecolors=_REPROJECTION_COLOUR, linewidths=0.9, label="reprojection")
+    axes.add_collection(LineCollection(list(pairs[np.isfinite(pairs).all((1, 2))]), colors=_REPROJECTION, linewidths=0.8))
+    axes.scatter(*given[used].T, s=12, color=_USED, linewidths=0, label="keypoint, used")
+    axes.scatter(*given[~used].T, s=18, color=_ASIDE, marker="x", linewidths=1, label="keypoint, set aside")
+    axes.scatter(*found.T, s=22, facecolors="none", edgecolors=_REPROJECTION, linewidths=0.9, label="reprojection")
 
 
 def _set_limits(axes: Axes, keypoints: Tensor, reprojections: Tensor, images: Tensor | None) -> None:

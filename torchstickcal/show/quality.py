@@ -6,6 +6,7 @@ import textwrap
 
 from torchstickcal.quality.finding import Finding, Severity
 from torchstickcal.quality.verdict import Acceptance, Quality, Verdict
+from torchstickcal.show.look import TERMINAL_COLOURS
 
 _MEANINGS = {
     Verdict.GOOD: "nothing speaks against the result",
@@ -13,13 +14,12 @@ _MEANINGS = {
     Verdict.POOR: "the result is probably wrong, or much less precise than it could be",
     Verdict.FAILED: "the result, or a part of it, must not be used",
 }
-_COLOURS = {Verdict.GOOD: "32", Verdict.USABLE: "33", Verdict.POOR: "31", Verdict.FAILED: "1;31"}
 _WIDTH = 118
 
 
 def colour_of(verdict: Verdict) -> str:
     """Parameters of a terminal's sequence SGR: green, yellow or red."""
-    return _COLOURS[verdict]
+    return TERMINAL_COLOURS[verdict]
 
 
 def meaning_of(verdict: Verdict) -> str:
@@ -61,7 +61,7 @@ def _accepted(acceptance: Acceptance) -> list[str]:
     known = [px for px in acceptance.left_out_px if px == px]
     if known:
         lines.append(f"each camera predicted by the others: {', '.join(f'{px:.2f}' for px in acceptance.left_out_px)} px")
-    return lines
+    return [part for line in lines for part in textwrap.wrap(line, _WIDTH, subsequent_indent="  ", break_long_words=False)]
 
 
 def _wrong(count: int) -> str:

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from torchstickcal.files import without_nan
 from torchstickcal.reconstruction import Reconstruction
-from torchstickcal.show.report import aligned, printable
+from torchstickcal.show.tables import printable, text_table
 
 
 def table(found: Reconstruction) -> str:
@@ -19,11 +19,11 @@ def table(found: Reconstruction) -> str:
         found.camera_names, found.reprojection_median_px.tolist(), _used(found), _offsets(found), strict=True
     ):
         rows.append([printable(name), f"{px:.3f}", str(used), offset])
-    text = [aligned(rows), ""]
+    text = [text_table(rows), ""]
     rows = [["point", "frames", "+- mm"]]
     for name, frames, std in zip(_names(found), _frames(found), found.points_std_m.nanmedian(0).values.tolist(), strict=True):
         rows.append([printable(name), str(frames), f"{1000 * std:.2f}" if std == std else "-"])
-    text += [aligned(rows), ""]
+    text += [text_table(rows), ""]
     if found.sticks:
         rows = [["stick (not used)", "given (m)", "mean (m)", "spread (mm)", "frames"]]
         for stick, lengths in zip(found.sticks, found.stick_lengths_m.mT, strict=True):
@@ -32,7 +32,7 @@ def table(found: Reconstruction) -> str:
             mean = f"{float(known.mean()):.5f}" if len(known) else "-"
             spread = f"{1000 * float(known.std()):.2f}" if len(known) > 1 else "-"
             rows.append([ends, f"{stick.length_m:.5f}", mean, spread, str(len(known))])
-        text += [aligned(rows), ""]
+        text += [text_table(rows), ""]
     text.append(found.world.description)
     text += [f"warning: {warning}" for warning in found.warnings]
     return "\n".join(text)

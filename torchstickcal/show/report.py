@@ -5,61 +5,45 @@ from __future__ import annotations
 import dataclasses
 from typing import Any
 
-from torch import Tensor
-
 from torchstickcal.files import without_nan
-from torchstickcal.model.unknowns import all_unknowns
 from torchstickcal.quality.finding import Severity
 from torchstickcal.result import Calibration, CameraParameter
+from torchstickcal.show.tables import (
+    camera_facts,
+    camera_table,
+    point_name,
+    point_table,
+    stage_table,
+    stick_table,
+    unknown_tables,
+)
 
 
-def table(calibration: Calibration) -> str:
-    """The calibration as a text to print: cameras, sticks, stages."""
-    cameras = zip(
-        map(printable, calibration.camera_names),
-        calibration.camera_centres.tolist(),
-        calibration.camera_std_m.tolist(),
-        calibration.camera_std_deg.tolist(),
-        calibration.reprojection_median_px.tolist(),
-        _keypoints_used(calibration),
-        strict=True,
-    )
-    rows = [["camera", "centre x, y, z (m)", "+- mm", "+- deg", "reprojection (px)", "keypoints"]]
-    rows += [
-        [
-            name,
-            " ".join(f"{v:8.4f}" for v in centre),
-            f"{1000 * std_m:.2f}",
-            f"{std_deg:.4f}",
-            f"{px:.3f}",
-            str(used),
-        ]
-        for name, centre, std_m, std_deg, px, used in cameras
-    ]
-    text = [aligned(rows), _frame(calibration), ""]
-    for name, parameter in calibration.unknowns.items():
-        known = bool(parameter.by_component("suggested").isfinite().any())
-        if known and (parameter.refined or all_unknowns()[name].noticeable_prior_share is not None):
-            text += [aligned(_parameter_rows(calibration, parameter)), ""]
-    if calibration.sticks:
-        rows = [["stick, fitted", "given (m)", "mean (m)", "spread (mm)", "frames"]]
-        for stick, lengths in zip(calibration.sticks, calibration.stick_lengths_m.mT, strict=True):
-            known = lengths[lengths.isfinite()]
-            spread = f"{1000 * float(known.std()):.2f}" if len(known) > 1 else "-"
-            ends = " - ".join(printable(_point_name(calibration, end)) for end in stick.ends)
-            mean = f"{float(known.mean()):.5f}" if len(known) else "-"
-            rows.append([ends, f"{stick.length_m:.5f}", mean, spread, str(len(known))])
-        text += [aligned(rows), ""]
-    rows = [["stage", "iterations", "cost", "time (ms)", ""]]
-    rows.append(["initialise", "", "", f"{1000 * calibration.seconds['initialise']:.1f}", ""])
-    for stage in calibration.stages:
-        last = stage.iterations[-1]
-        rows.append([stage.name, str(last.iteration), f"{last.cost:.6g}", f"{1000 * stage.seconds:.1f}", str(stage.stop)])
-    rows.append(["total", "", "", f"{1000 * calibration.seconds['total']:.1f}", ""])
-    text.append(aligned(rows))
-    notes = [finding for finding in calibration.quality.findings if finding.severity == Severity.NOTE]
-    text += ["", *(f"note: {finding.text}" for finding in notes)] if notes else []
-    return "\n".join(text)
+def table(calibration: Calibration, verbose: bool = True) -> str:
+    """The calibration as a text to print: cameras, what was estimated of them, and the findings.
+
+    Args:
+        calibration: what was found.
+        verbose: whether also what was only checked of the cameras, sticks, points and stages are shown.
+    """
+    tables = [camera_table(camera_facts(calibration)), *unknown_tables(calibration, only_refined=not verbose)]
+    if verbose:
+        tables += [stick for stick in (stick_table(calibration),) if stick is not None]
+        tables += [point_table(calibration), stage_table(calibration)]
+    text = [f"{one.title}\n{one.text()}" if number else one.text() for number, one in enumerate(tables)]
+    text.insert(1, frame_sentence(calibration))
+    if verbose:
+        notes = [finding for finding in calibration.quality.findings if finding.severity == Severity.NOTE]
+        text += ["\n".join(f"note: {finding.text}" for finding in notes)] if notes else []
+    return "\n\n".join(text)
+
+
+def frame_sentence(calibration: Calibration) -> str:
+    """The frame of the world, and how well it is known."""
+    world, known = calibration.world, ""
+    if world.vertical_std_deg is not None and world.floor_std_m is not None:
+        known = f" Vertical ± {world.vertical_std_deg:.1f} deg, floor ± {1000 * world.floor_std_m:.0f} mm."
+    return world.description + known
 
 
 def summary(calibration: Calibration) -> dict[str, Any]:
@@ -100,7 +84,7 @@ def summary(calibration: Calibration) -> dict[str, Any]:
             "refined": list(calibration.refined),
             "unknowns": {name: _parameter_summary(calibration, parameter) for name, parameter in calibration.unknowns.items()},
             "points": [
-                {"name": _point_name(calibration, index), "sigma_px": sigma}
+                {"name": point_name(calibration, index), "sigma_px": sigma}
                 for index, sigma in enumerate(calibration.sigma_px.tolist())
             ],
             "scale_std": float(calibration.scale_std),
@@ -132,47 +116,6 @@ def summary(calibration: Calibration) -> dict[str, Any]:
     )
 
 
-def _frame(calibration: Calibration) -> str:
-    """The frame of the world, and how well it is known, in one line."""
-    world = calibration.world
-    known = ""
-    if world.vertical_std_deg is not None and world.floor_std_m is not None:
-        known = f" Vertical ± {world.vertical_std_deg:.1f} deg, floor ± {1000 * world.floor_std_m:.0f} mm."
-    return world.description + known
-
-
-def printable(text: str) -> str:
-    r"""A text for one place in a table: line ends and other characters that have no shape of their own are escaped.
-
-    Example:
-        >>> print(printable("left\ncamera"))
-        left\ncamera
-    """
-    return "".join(letter if letter.isprintable() else letter.encode("unicode_escape").decode() for letter in text)
-
-
-def _parameter_rows(calibration: Calibration, parameter: CameraParameter) -> list[list[str]]:
-    """A table of one unknown of the cameras: what was given, what was used, and what the keypoints suggest."""
-    factor, unit = (1000, "ms") if parameter.unit == "s" else (1, parameter.unit)
-    components = parameter.components
-    in_unit = f" ({unit})" if unit else ""
-    heads = "estimated" if parameter.refined else "as given", "suggested"
-    rows = [[parameter.label, *(f"{component}{in_unit}: {head}" for component in components for head in heads)]]
-
-    def quantity(values: Tensor, stds: Tensor) -> str:
-        value, std = factor * float(values), factor * float(stds)
-        return f"{value:.5g}" if std != std else f"{value:.5g} ± {std:.2g}"
-
-    for camera, label in enumerate(calibration.camera_names):
-        cells = [
-            quantity(parameter.by_component(value)[camera, number], parameter.by_component(std)[camera, number])
-            for number in range(len(components))
-            for value, std in (("value", "std"), ("suggested", "suggested_std"))
-        ]
-        rows.append([printable(label), *cells])
-    return rows
-
-
 def _parameter_summary(calibration: Calibration, parameter: CameraParameter) -> dict[str, Any]:
     """One unknown of the cameras as JSON can hold it."""
     tensors = ("value", "std", "given", "suggested", "suggested_std")
@@ -193,18 +136,3 @@ def _parameter_summary(calibration: Calibration, parameter: CameraParameter) -> 
 
 def _keypoints_used(calibration: Calibration) -> list[int]:
     return calibration.inliers.flatten(1).sum(1).tolist()
-
-
-def _point_name(calibration: Calibration, index: int) -> str:
-    return calibration.point_names[index] if calibration.point_names else f"point {index}"
-
-
-def aligned(rows: list[list[str]]) -> str:
-    """Rows of cells as a table, the first row as its head."""
-    widths = [max(len(row[column]) for row in rows) for column in range(len(rows[0]))]
-    lines = [
-        "  ".join(cell.ljust(w) if column == 0 or (not cell[:1].isdigit() and cell[:1] not in "- ") else cell.rjust(w)
-                  for column, (cell, w) in enumerate(zip(row, widths, strict=True))).rstrip()
-        for row in rows
-    ]  # fmt: skip
-    return "\n".join([lines[0], "-" * max(map(len, lines)), *lines[1:]])

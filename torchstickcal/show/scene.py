@@ -10,7 +10,9 @@ import torch
 from torch import Tensor
 
 from torchstickcal.result import Calibration
-from torchstickcal.show.rig import BONES, frusta, plot_rotation
+from torchstickcal.show.look import COLOURS, camera_colour
+from torchstickcal.show.skeleton import bones_of
+from torchstickcal.show.space import frusta, plot_rotation
 
 _FRUSTUM_EDGES = ((0, 1), (0, 2), (0, 3), (0, 4), (1, 2), (2, 3), (3, 4), (4, 1))
 _EDGE = 0.025
@@ -18,11 +20,6 @@ _EDGE = 0.025
 _TUBE_CORNERS = 6
 _BONE_M, _STICK_M, _POINT_M = 0.025, 0.02, 0.04
 """Radii of what is drawn."""
-_BODY_COLOUR, _STICK_COLOUR = (70, 75, 80), (209, 73, 91)
-_CAMERA_COLOURS = (
-    (31, 119, 180), (255, 127, 14), (44, 160, 44), (148, 103, 189), (140, 86, 75),
-    (227, 119, 194), (127, 127, 127), (188, 189, 34), (23, 190, 207), (31, 60, 120),
-)  # fmt: skip
 _Y_UP = ((1.0, 0.0, 0.0), (0.0, 0.0, 1.0), (0.0, -1.0, 0.0))
 """From z up to y up, as the mesh plugin has it."""
 
@@ -64,16 +61,15 @@ def scene_mesh(calibration: Calibration, frame: int) -> Mesh:
     points = calibration.points[frame].detach().double().cpu() @ rotation.mT
     middle = cameras[:, 0].mean(0)
     cameras, points = cameras - middle, points - middle
-    index = {name: number for number, name in enumerate(calibration.point_names or ())}
-    bones = [(index[first], index[second]) for first, second in BONES if first in index and second in index]
+    bones = bones_of(calibration.point_names)
     thickness = _EDGE * float((cameras[0, 1] - cameras[0, 0]).norm())
     parts = [_tubes(corners, _FRUSTUM_EDGES, thickness) for corners in cameras]
-    colours = [_CAMERA_COLOURS[number % len(_CAMERA_COLOURS)] for number in range(len(cameras))]
+    colours = [camera_colour(number).rgb for number in range(len(cameras))]
     sticks = [stick.ends for stick in calibration.sticks]
     for shape in (_tubes(points, bones, _BONE_M), _octahedra(points, _POINT_M), _tubes(points, sticks, _STICK_M)):
         parts.append(shape)
-        colours.append(_BODY_COLOUR)
-    colours[-1] = _STICK_COLOUR
+        colours.append(COLOURS["body"].rgb)
+    colours[-1] = COLOURS["stick"].rgb
     return Mesh.of(parts, colours)
 
 

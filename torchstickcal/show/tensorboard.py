@@ -25,9 +25,11 @@ from torchstickcal.metrics import pose_errors
 from torchstickcal.observations import Observations
 from torchstickcal.result import Calibration
 from torchstickcal.show.pictures import keypoints_figure, residuals_figure
-from torchstickcal.show.report import printable, table
+from torchstickcal.show.quality import meaning_of
+from torchstickcal.show.report import table
 from torchstickcal.show.rig import rig_figure
 from torchstickcal.show.scene import mesh_view, scene_mesh
+from torchstickcal.show.tables import printable
 from torchstickcal.solvers import IterationRecord
 
 if TYPE_CHECKING:
@@ -246,7 +248,10 @@ class _CalibrationLog:
         for name, used, found in zip(self._names, calibration.inliers, sizes, strict=True):
             _write_histogram(writer, f"residuals (px)/{name}", found[used], last)
         _write_histogram(writer, "stick/length in each frame (m)", calibration.stick_lengths_m, last)
-        writer.add_text("results", _code(table(calibration)))
+        quality = calibration.quality
+        sentence = f"\n{quality.acceptance.sentence}" if quality.acceptance is not None else ""
+        verdict = f"verdict: {quality.verdict} ({meaning_of(quality.verdict)}){sentence}"
+        writer.add_text("results", _code(f"{verdict}\n\n{table(calibration)}"))
         warnings = "\n".join(f"- {printable(warning)}" for warning in calibration.warnings)
         writer.add_text("warnings", f"{calibration.status}\n\n{warnings or 'No warnings.'}", last)
         self._write_metrics(calibration)

@@ -1,0 +1,43 @@
+"""The command `report`."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from torchstickcal.cli.outputs import EXIT_DONE, PAGE_FILE, POINTS_FILE, REPORT_FILE
+
+if TYPE_CHECKING:
+    from torchstickcal.result import Calibration
+
+
+def report(options: argparse.Namespace) -> int:
+    """Write the page of saved results."""
+    from torchstickcal.files import atomic_path, try_writing
+    from torchstickcal.result import Calibration
+    from torchstickcal.show.page.page import report_page
+
+    folder: Path = options.folder
+    calibration = Calibration.load(folder / POINTS_FILE)
+    try_writing(folder, [PAGE_FILE], where="report")
+    page = report_page(calibration, _made_of(folder / REPORT_FILE, calibration))
+    with atomic_path(folder / PAGE_FILE) as temporary:
+        temporary.write_text(page, "utf-8")
+    print(f"{folder / PAGE_FILE}: open it in a browser")
+    return EXIT_DONE
+
+
+def _made_of(path: Path, calibration: Calibration) -> dict[str, Any]:
+    """What results were made of, as the report beside them says it; nothing if there is none.
+
+    Raises:
+        FileFormatError: if it is not such a report.
+    """
+    from torchstickcal.untrusted import read_json, reading
+
+    if not path.is_file():
+        return {}
+    with reading(path, "a report that `calibrate` wrote", "not a report"):
+        found = calibration.summary().keys()
+        return {name: value for name, value in read_json(path).items() if name not in found}

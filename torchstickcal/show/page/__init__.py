@@ -1,0 +1,1 @@
+"""A calibration as a page: one file of HTML that needs nothing else."""
