@@ -124,7 +124,7 @@ def folder_of(name: str) -> str:
 
     Example:
         >>> folder_of("swing 1.npz"), folder_of("day 2/swing.npz")
-        ('swing 1.npz', 'day 2_swing.npz-a86e6b7a')
+        ('swing 1.npz', 'day 2_swing.npz-ecca6757')
     """
     plain = re.sub(r"[^\w .+=@-]", "_", name)[:_LONGEST_FOLDER].strip(" .")
     if plain == name:
