@@ -207,6 +207,22 @@ class CameraPointLoss(Loss, ABC):
             value = self.total(self._squared(moving, pixels, cameras) * information)
             return tangent(value) / 2
 
+    def point_information(
+        self, points_cam: Tensor, rotations: Tensor, pixels: Tensor, information: Tensor, cameras: Intrinsics
+    ) -> Tensor:
+        """The Gauss-Newton blocks J^T J by the points, summed over the cameras, (..., 6, N); differentiable by all arguments.
+
+        The arguments are those of :meth:`linearise`.
+        """
+        weights = self.weight * information * self.kernel.weight(self._squared(points_cam, pixels, cameras) * information)
+        columns: list[Tensor] = []
+        for axis in rotations.unbind(-1):
+            with forward_ad.dual_level():
+                moving = forward_ad.make_dual(points_cam, axis.unsqueeze(-1).expand_as(points_cam))
+                columns.append(tangent(self._residuals(moving.mT, pixels.mT, cameras)))
+        pairs = [(columns[i] * columns[j]).sum(-1) for i in range(3) for j in range(i, 3)]
+        return torch.stack([(weights * pair).sum(-2) for pair in pairs], dim=-2)
+
     def _squared(self, points_cam: Tensor, pixels: Tensor, cameras: Intrinsics) -> Tensor:
         """Squared residuals (..., C, N), not divided by sigma."""
         return self._residuals(points_cam.mT, pixels.mT, cameras).square().sum(-1)

@@ -119,6 +119,26 @@ class FrameLoss(Loss, ABC):
             squared = self._squared(forward_ad.make_dual(at, along), known, lengths_m)
             return tangent(self.total(squared * self.information(squared))) / 2
 
+    def point_information(self, points: Tensor, sticks: Tensor, lengths_m: Tensor, active: Tensor) -> Tensor:
+        """The Gauss-Newton blocks J^T J of each point by itself, (..., 6, F, P); differentiable by points and lengths."""
+        groups = self.groups(sticks)
+        known = active[..., groups].all(-1)
+        at = _in_general_position(points[..., groups].movedim(-4, -1), known)
+        whitened = self._squared(at, known, lengths_m)
+        whitened = whitened * self.information(whitened)
+        weights = self.weight * self.information(whitened) * known * self.kernel.weight(whitened)
+        found = points.new_zeros(*points.shape[:-3], 6, *points.shape[-2:])
+        for member, indices in enumerate(groups.unbind(1)):
+            columns: list[Tensor] = []
+            for axis in range(3):
+                along = torch.zeros_like(at)
+                along[..., member, axis] = 1.0
+                with forward_ad.dual_level():
+                    columns.append(tangent(self.residuals(forward_ad.make_dual(at, along), lengths_m)))
+            pairs = [weights * (columns[i] * columns[j]).sum(-1) for i in range(3) for j in range(i, 3)]
+            found = found.index_add(-1, indices, torch.stack(pairs, dim=-3))
+        return found
+
     def checked_groups(self, sticks: Tensor, points: int) -> Tensor:
         """:meth:`groups` of a session with so many points.
 

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from torchstickcal.geometry import projection
 from torchstickcal.geometry.cameras import Intrinsics, PixelMap, inverse_depths
-from torchstickcal.geometry.symmetric import symmetric_product
+from torchstickcal.geometry.symmetric import outer, symmetric_product
 from torchstickcal.losses.camera_point import CameraPointLoss, CameraPointTerms, CameraUnknownsAt, UnknownTerms
 from torchstickcal.losses.registry import LossContext, LossSettings, register_loss
 from torchstickcal.losses.robust import Quadratic, Repeated, RobustKernel, robust_kernel
@@ -185,6 +185,21 @@ class ReprojectionLoss(CameraPointLoss):
         rx, ry = m.x - pixels[..., 0, :], m.y - pixels[..., 1, :]
         weights = self.weight * information * self.kernel.weight((rx.square() + ry.square()) * information)
         return (weights * (rx * moved_x + ry * moved_y)).sum()
+
+    def point_information(
+        self, points_cam: Tensor, rotations: Tensor, pixels: Tensor, information: Tensor, cameras: Intrinsics
+    ) -> Tensor:
+        x, y, z = points_cam.unbind(-2)
+        inverse_depth = inverse_depths(z.where(information > 0, 1.0))
+        u, v = x * inverse_depth, y * inverse_depth
+        m = cameras.pixels_with_jacobian(u, v)
+        squared = (m.x - pixels[..., 0, :]).square() + (m.y - pixels[..., 1, :]).square()
+        weights = self.weight * information * self.kernel.weight(squared * information) * inverse_depth.square()
+        first, second, third = rotations[..., None].unbind(-3)
+        p, q = first - u.unsqueeze(-2) * third, second - v.unsqueeze(-2) * third
+        by_x = p * m.dx_du.unsqueeze(-2) + q * m.dx_dv.unsqueeze(-2)
+        by_y = p * m.dy_du.unsqueeze(-2) + q * m.dy_dv.unsqueeze(-2)
+        return ((outer(by_x) + outer(by_y)) * weights.unsqueeze(-2)).sum(-3)
 
 
 @register_loss("reprojection")

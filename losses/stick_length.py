@@ -96,6 +96,16 @@ class StickLengthLoss(FrameLoss):
         starts, ends = moved[..., sticks].unbind(-1)
         return (weights * residual * (difference * (ends - starts)).sum(-3) / length).sum()
 
+    def point_information(self, points: Tensor, sticks: Tensor, lengths_m: Tensor, active: Tensor) -> Tensor:
+        difference, length, information = self._between(points, sticks, active)
+        weights = self.weight * information * self.kernel.weight((length - lengths_m).square() * information)
+        direction = difference / length.unsqueeze(-3)
+        blocks = outer(direction.flatten(-2)).unflatten(-1, length.shape[-2:]) * weights.unsqueeze(-3)
+        found = points.new_zeros(*points.shape[:-3], 6, *points.shape[-2:])
+        for end in sticks.unbind(1):
+            found = found.index_add(-1, end, blocks)
+        return found
+
     def _between(self, points: Tensor, sticks: Tensor, active: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """From one end to the other (..., 3, F, S), the lengths (..., F, S), and 1 / sigma^2, zero for unknown ends."""
         start, end = sticks.unbind(1)

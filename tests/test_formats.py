@@ -138,8 +138,8 @@ def test_a_format_can_be_forced(shipped: dict[str, tuple[Registry, Path]]):
         read_session(shipped["npz"][1], "npx")
     with pytest.raises(ConfigError, match=r"unknown calibration format.*'npz'.*pose2sim"):
         read_calibration(shipped["npz"][1], "npz")
-    with pytest.raises(ConfigError, match=r"unknown output format.*'trc'.*pose2sim"):
-        write_calibration("out", calibrate(golf_session(cameras=3, frames=10)[0]), "trc")
+    with pytest.raises(ConfigError, match=r"unknown output format.*'trk'.*pose2sim"):
+        write_calibration("out", calibrate(golf_session(cameras=3, frames=10)[0]), "trk")
 
 
 def test_a_reader_of_one_s_own_reads_a_folder(toy: Path):

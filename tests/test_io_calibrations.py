@@ -16,6 +16,7 @@ import torch
 
 from torchstickcal import CalibrationError, FileFormatError, Stick
 from torchstickcal.cli import main
+from torchstickcal.geometry.cameras import Intrinsics
 from torchstickcal.io import (
     CALIBRATION_READERS,
     KEYPOINT_READERS,
@@ -28,7 +29,8 @@ from torchstickcal.io import (
     write_npz,
 )
 from torchstickcal.io.formats import head_of
-from torchstickcal.io.lenses import lenses_of
+from torchstickcal.io.given import amended
+from torchstickcal.io.lenses import arranged, lenses_of
 from torchstickcal.simulate import golf_session
 
 NAMES = ("cam2", "cam9", "cam10")
@@ -412,3 +414,40 @@ def test_a_session_takes_the_intrinsics_of_a_file(what: str, tmp_path: Path):
     assert told.intrinsics_known
     torch.testing.assert_close(told.intrinsics, rig().intrinsics)
     assert told.distortion is not None
+
+
+@pytest.mark.parametrize("turned", ["left", "right", "back"])
+@pytest.mark.parametrize(("fisheye", "coefficients"), [(False, 5), (False, 12), (True, 4)])
+def test_turned_images_are_put_right(turned: str, fisheye: bool, coefficients: int):
+    """The turned camera projects to where the pixels of the turned image are, with every part of its lens."""
+    width, height = SIZE
+    lens = np.random.default_rng(coefficients).normal(0, 0.01, coefficients)
+    given = Rig.of([RigCamera("cam2", MATRICES[0], lens, fisheye, SIZE, VECTORS[1], TRANSLATIONS[1])])
+    points = torch.from_numpy(np.random.default_rng(1).normal(0, 0.4, (20, 3)))
+
+    def seen(camera: Rig) -> torch.Tensor:
+        cameras = Intrinsics(camera.intrinsics, torch.stack(list(camera.distortion)), fisheye)
+        return cameras.project((points @ camera.rotations[0].mT + camera.translations[0])[None])[0]
+
+    x, y = seen(given).unbind(-1)
+    expected = {"right": (height - 1 - y, x), "left": (y, width - 1 - x), "back": (width - 1 - x, height - 1 - y)}[turned]
+    found, notes = arranged(given, ["cam2"], None, turned)
+    assert (seen(found) - torch.stack(expected, dim=-1)).abs().max() < 1e-9
+    assert found.image_size.tolist() == [[width, height] if turned == "back" else [height, width]]
+    assert "were turned" in notes[0]
+    size = torch.tensor([[1920.0, 1080.0] if turned == "back" else [1080.0, 1920.0]])
+    larger, _ = arranged(given, ["cam2"], size, turned)
+    assert (larger.intrinsics[0, 0, 0] / found.intrinsics[0, 0, 0] - 1.5).abs() < 1e-9
+
+
+def test_images_that_cannot_be_turned_are_refused():
+    unknown = Rig.of([RigCamera("cam2", MATRICES[0], (), False, None)])
+    with pytest.raises(CalibrationError, match="cannot be turned without their size"):
+        arranged(unknown, ["cam2"], None, "left")
+    tilted = Rig.of([RigCamera("cam2", MATRICES[0], [0.0] * 12 + [0.1, 0.2], False, SIZE)])
+    with pytest.raises(CalibrationError, match="a tilted sensor"):
+        arranged(tilted, ["cam2"], None, "left")
+    with pytest.raises(CalibrationError, match=r"no such turn.*'up'.*left, right, back"):
+        arranged(rig(), NAMES, None, "up")
+    with pytest.raises(CalibrationError, match="nothing to turn"):
+        amended(golf_session(cameras=3, frames=5)[0], Given(turned="left"))

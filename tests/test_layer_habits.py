@@ -112,7 +112,8 @@ def test_vmap_over_sessions_is_the_batch():
     confidence = torch.linspace(0.5, 1.0, 3, dtype=torch.float64)
 
     def one(keypoints: Tensor, matrix: Tensor, trust: Tensor) -> Tensor:
-        return spread(keypoints, matrix, trust.expand(keypoints.shape[:-1]))
+        of_cameras = trust ** torch.arange(keypoints.shape[0])
+        return spread(keypoints, matrix, of_cameras[:, None, None].expand(keypoints.shape[:-1]))
 
     arguments = SESSIONS, LENS.matrix, confidence
     alone = [gradient_of(one, SESSIONS[k], LENS.matrix, confidence[k]) for k in range(3)]

@@ -19,6 +19,8 @@ if TYPE_CHECKING:
     from torchstickcal.many import calibrate_many
     from torchstickcal.observations import Observations
     from torchstickcal.pipeline.calibrate import Callback, calibrate
+    from torchstickcal.pipeline.triangulate import triangulate
+    from torchstickcal.reconstruction import Reconstruction
     from torchstickcal.result import Calibration
     from torchstickcal.show.tensorboard import TensorBoardMonitor
     from torchstickcal.solvers.gradients import GaussNewton, GradientMode, Implicit, Unrolled
@@ -42,6 +44,7 @@ _HOMES = {
     "LayerResult": "layer.result",
     "ObservationError": "errors",
     "Observations": "observations",
+    "Reconstruction": "reconstruction",
     "RigError": "errors",
     "Stick": "stick",
     "TensorBoardMonitor": "show.tensorboard",
@@ -50,6 +53,7 @@ _HOMES = {
     "calibrate_many": "many",
     "config_names": "config",
     "load_config": "config",
+    "triangulate": "pipeline.triangulate",
 }
 _SUBPACKAGES = {"bridges", "io", "losses", "metrics", "simulate"}
 
@@ -69,6 +73,7 @@ __all__ = [
     "LayerResult",
     "ObservationError",
     "Observations",
+    "Reconstruction",
     "RigError",
     "Stick",
     "TensorBoardMonitor",
@@ -77,6 +82,7 @@ __all__ = [
     "calibrate_many",
     "config_names",
     "load_config",
+    "triangulate",
 ]
 
 

@@ -14,6 +14,9 @@ from importlib import resources
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
+import torch
+from torch import Tensor
+
 from torchstickcal.errors import ConfigError
 from torchstickcal.files import parse_toml
 from torchstickcal.losses import LOSSES, CameraPointLoss, LossSettings, ReprojectionSettings
@@ -130,6 +133,10 @@ class Config:
         synchronise: whether ``auto`` may estimate clocks.
         max_offset_s: largest time offset from the first camera that is searched for, seconds. Where the motion repeats itself,
             choose less than half its period.
+        noise: whether losses whose ``sigma_px`` is ``estimated`` take it from the session, or from what is ``given`` here. The
+            choice of outliers always goes by the estimate.
+        sigma_px: where the noise is given, the standard deviation along each axis of a keypoint of confidence 1, pixels: one
+            number, or a list with one for each point.
 
     Example:
         >>> config = load_config({"extends": "default", "stages": {"metric": {"stick_length": {"sigma_m": 0.003}}}})
@@ -151,6 +158,13 @@ class Config:
     camera_groups: list[str] = field(default_factory=list)
     synchronise: bool = True
     max_offset_s: Positive = 2.0
+    noise: Literal["estimated", "given"] = "estimated"
+    sigma_px: Positive | list[Positive] = 1.0
+
+    @property
+    def given_sigma_px(self) -> Tensor | None:
+        """The given standard deviations of the keypoints, () or (P,), pixels; None where they are estimated."""
+        return None if self.noise == "estimated" else torch.tensor(self.sigma_px, dtype=torch.float64)
 
 
 def config_names() -> list[str]:
@@ -189,6 +203,15 @@ def load_config(config: str | Path | Mapping[str, Any] | Config = "default") -> 
     if not built.stages:
         raise ConfigError("nothing to do", where=f"{where}: stages", got="no stage", expected="at least one")
     return built
+
+
+def with_noise(config: Config, noise: Any) -> Config:
+    """A configuration whose noise is ``estimated`` or ``given``.
+
+    Raises:
+        ConfigError: if it is to be neither.
+    """
+    return dataclasses.replace(config, noise=build(typing.get_type_hints(Config)["noise"], noise, "argument", ("noise",)))
 
 
 def with_refine(config: Config, refine: Any) -> Config:

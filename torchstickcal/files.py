@@ -41,6 +41,7 @@ def atomic_set(folder: str | Path) -> Iterator[Path]:
     """A temporary folder for files that belong together. They take their places in ``folder`` if the block succeeds.
 
     Files of the same names are replaced; others in ``folder`` stay as they are. ``folder`` is created if it does not exist.
+    There may be folders among them, for whose files the same holds.
 
     If the block fails or is interrupted, the disk is full, or a file cannot be replaced, ``folder`` is as before. No operating
     system exchanges several files at once: where the process is killed or the machine stops during the exchange, which takes a
@@ -66,7 +67,7 @@ def atomic_set(folder: str | Path) -> Iterator[Path]:
         new.mkdir()
         old.mkdir()
         yield new
-        names = sorted(path.name for path in new.iterdir())
+        names = sorted(path.relative_to(new).as_posix() for path in new.rglob("*") if not path.is_dir())
         for name in names:
             _to_disk(new / name)
         with _alone(folder):
@@ -200,13 +201,14 @@ def _created(folder: Path, keep: bool = True) -> Iterator[None]:
 def _exchange(folder: Path, names: list[str], new: Path, old: Path) -> None:
     """Move files from ``folder`` to ``old``, then those of the same names from ``new`` to ``folder``; undo it on an error."""
     for name in names:
-        if (folder / name).is_dir() and not (new / name).is_dir():
+        if (folder / name).is_dir():
             raise IsADirectoryError(f"a folder has the name of a file to be written: {folder / name}")
     moves: list[tuple[Path, Path]] = []
     try:
         for source, target in ((folder, old), (new, folder)):
             for name in names:
                 if os.path.lexists(source / name):
+                    (target / name).parent.mkdir(parents=True, exist_ok=True)
                     moves.append((source / name, target / name))
                     (source / name).rename(target / name)
             _to_disk(folder)

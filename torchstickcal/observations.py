@@ -16,6 +16,9 @@ from torchstickcal.errors import ObservationError, ObservationWarning
 from torchstickcal.geometry.cameras import Intrinsics
 from torchstickcal.stick import Stick, check_ends, located_sticks, point_index
 
+LEAST_CONFIDENCE = 1e-4
+"""Confidence, as a share of the session's largest, up to which a keypoint counts as not seen. Where nothing else determines a
+point, such keypoints would: with errors and gradients that are larger the smaller the confidence is."""
 _COEFFICIENTS = (4, 5, 8, 12, 14)
 _FISHEYE_COEFFICIENTS = (4,)
 _LARGEST_INTRINSIC = 1e9
@@ -33,7 +36,9 @@ class Observations:
         sticks: one stick or several; empty if the scale comes from elsewhere.
         distortion: (C, D), or one (D,) for all, OpenCV's order, D of 4, 5, 8, 12 or 14; None for perfect lenses. Rows and
             columns as OpenCV returns them, (1, D), (D, 1), (C, 1, D) and (C, D, 1), are accepted too.
-        confidence: (C, F, P) in [0, 1], the weight of a keypoint: its variance is divided by it. 0 means not seen.
+        confidence: (C, F, P) in [0, 1], the weight of a keypoint relative to the noise of its point: the variance of a keypoint
+            is the point's, divided by the keypoint's confidence. 0 means not seen, and so does 1/10000 of the session's largest
+            confidence or less: such a keypoint would be a hundred times as uncertain as the best.
         image_size: width and height in pixels, (C, 2) or (2,).
         fps: frames per second.
         point_names: P names. camera_names: C names.
@@ -83,7 +88,7 @@ class Observations:
     timestamps: Tensor | None = None
     readout_s: float | None = None
     visible: Tensor = field(init=False, repr=False, compare=False)
-    """(C, F, P), True where a keypoint is given with a confidence above 0."""
+    """(C, F, P), True where a keypoint is given with a confidence that counts."""
 
     def __init__(
         self,
@@ -126,7 +131,10 @@ class Observations:
         put(self, "readout_s", None if readout_s is None else _readout(readout_s))
         self._check_times()
         visible = self.keypoints.isfinite().all(-1)
-        put(self, "visible", visible if self.confidence is None else visible & (self.confidence > 0))
+        if self.confidence is not None:
+            largest = self.confidence.where(visible, 0.0).max()
+            visible = visible & (self.confidence > LEAST_CONFIDENCE * largest)
+        put(self, "visible", visible)
         put(self, "sticks", located_sticks(sticks, self.point_names))
         self._check_sticks()
         if sys._getframe(1).f_globals.get("__name__") != "dataclasses":  # replace() changes what has been warned about

@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from torchstickcal.arrays import FARTHEST_PX, number_of, tensor_of
-from torchstickcal.errors import ObservationError
+from torchstickcal.errors import CalibrationError, ObservationError
 from torchstickcal.files import atomic_path
 from torchstickcal.geometry import se3
 from torchstickcal.geometry.cameras import Intrinsics
@@ -23,8 +23,9 @@ from torchstickcal.solvers import IterationRecord, StageRecord, Stop
 from torchstickcal.solvers.uncertainty import centre_covariances, point_covariances, relative_scale_std
 from torchstickcal.stick import Stick
 from torchstickcal.untrusted import open_arrays, reading
+from torchstickcal.world import WORLDS, Frame, World, athlete_frame, floor_frame
 
-_FORMAT = "torchstickcal calibration 7"
+_FORMAT = "torchstickcal calibration 8"
 _TENSORS = {
     "rotations": "C 3 3",
     "translations": "C 3",
@@ -79,13 +80,14 @@ class CameraParameter:
         return tensor.view(len(tensor), -1)
 
 
+_CAMERA_WORLD = World()
 _UNKNOWN = "unknown_"
 _PARAMETER_TENSORS = ("value", "std", "given", "prior_std", "suggested", "suggested_std")
 
 
 @dataclass(frozen=True, eq=False)
 class Calibration:
-    """A calibrated rig and the scene it saw, in metres, in the frame of the first camera.
+    """A calibrated rig and the scene it saw, in metres, in the frame of the first camera unless :attr:`world` says another.
 
     Floating-point tensors have the dtype and device of the keypoints that they were estimated from.
 
@@ -112,8 +114,8 @@ class Calibration:
     frames of the session, unless time offsets were estimated or timestamps were given."""
     covariance: Tensor
     """(6 (C - 1), 6 (C - 1)), float64, of the tangents (translation, rotation; metres, radians) of all cameras but the first,
-    which is the world: ``T_true = T Exp(tangent)``. It contains errors of the keypoints that last for several frames, and the
-    stated deviations of the sticks' lengths, which are common to all frames."""
+    relative to which the others are uncertain: ``T_true = T Exp(tangent)``. It contains errors of the keypoints that last for
+    several frames, and the stated deviations of the sticks' lengths, which are common to all frames."""
     residuals_px: Tensor
     """(C, F, P, 2), projection minus keypoint, pixels, of inliers and outliers; NaN where not seen or the point is not known"""
     inliers: Tensor
@@ -156,6 +158,52 @@ class Calibration:
     left_out: tuple[str, ...] = ()
     """names of the cameras that share too little with the others, where only the largest part was to be calibrated. They are in
     no other part of the result."""
+    world: World = _CAMERA_WORLD
+    """the frame of cameras and points: where its origin is and how its axes lie"""
+
+    def in_world(self, world: str | Frame) -> Calibration:
+        """The same calibration in another frame: poses, points and covariance.
+
+        Args:
+            world: ``camera``: the frame of the first camera. ``athlete``: z up, the origin on the floor below the athlete's
+                feet in the first frame, x where the athlete faces. ``floor``: z up, the origin on the floor below the first
+                camera, x in its viewing direction. Or a frame, from :func:`torchstickcal.world.frame_of_points` or
+                :func:`torchstickcal.world.frame_of_cameras`.
+
+        Raises:
+            CalibrationError: if there is no such frame, or if it needs the head and the ankles of an athlete and these are not
+                known.
+
+        Example:
+            >>> from torchstickcal import calibrate
+            >>> from torchstickcal.simulate import golf_session
+            >>> calibration = calibrate(golf_session(cameras=3, frames=30)[0]).in_world("athlete")
+            >>> head = calibration.points[0, calibration.point_names.index("head_top")]
+            >>> calibration.world.name, bool(1.4 < head[2] < 1.8), bool((calibration.camera_centres[:, 2] > 0).all())
+            ('athlete', True, True)
+        """
+        frame = self._frame(world) if isinstance(world, str) else world
+        rotations, translations = frame.poses(self.rotations.double().cpu(), self.translations.double().cpu())
+        return dataclasses.replace(
+            self,
+            rotations=rotations.to(self.rotations),
+            translations=translations.to(self.translations),
+            points=frame.points(self.points.double().cpu()).to(self.points),
+            covariance=frame.covariance(self.covariance.cpu()).to(self.covariance),
+            world=frame.world,
+        )
+
+    def _frame(self, world: str) -> Frame:
+        """A frame of :data:`torchstickcal.world.WORLDS`, relative to the present one."""
+        if world == "camera":
+            return Frame(self.rotations[0].double().cpu(), self.translations[0].double().cpu(), World())
+        if world == "athlete":
+            return athlete_frame(self.points, self.point_names, self.rotations)
+        if world == "floor":
+            return floor_frame(self.points, self.point_names, self.rotations, self.translations)
+        raise CalibrationError(
+            "unknown frame of the world", where="world", got=repr(world), expected=f"one of {', '.join(WORLDS)}, or a Frame"
+        )
 
     @property
     def converged(self) -> bool:
@@ -196,7 +244,7 @@ class Calibration:
 
     @property
     def camera_std_m(self) -> Tensor:
-        """(C,), standard deviation of each camera's centre from its true position, in the first camera's frame, metres."""
+        """(C,), standard deviation of each camera's centre from its true position relative to the first camera, metres."""
         covariances = centre_covariances(self.camera_centres.double(), self.covariance)
         return covariances.diagonal(dim1=1, dim2=2).sum(1).sqrt().to(self.rotations.dtype)
 
@@ -222,7 +270,7 @@ class Calibration:
         A point counts as seen by every camera in front of which it lies and, where the image sizes are known, in whose image.
 
         Args:
-            points: (..., 3), metres, in the frame of the first camera, as a tensor, array or list.
+            points: (..., 3), metres, in the frame of the calibration, as a tensor, array or list.
             sigma_px: noise of their keypoints along an axis, pixels; None for the median over the calibration's points.
 
         Returns:
@@ -294,6 +342,7 @@ class Calibration:
             "seconds": self.seconds,
             "warnings": self.warnings,
             "left_out": self.left_out,
+            "world": dataclasses.asdict(self.world),
         }
         with atomic_path(path) as temporary, temporary.open("wb") as file:
             np.savez_compressed(file, meta=np.array(json.dumps(meta)), **arrays)
@@ -328,6 +377,7 @@ class Calibration:
                 seconds=_numbers(meta["seconds"]),
                 warnings=_texts(meta["warnings"]),
                 left_out=_texts(meta["left_out"]),
+                world=_world(meta["world"]),
             )
             counts = {"C": calibration.camera_names, "P": calibration.point_names, "S": calibration.sticks}
             if any(given is not None and len(given) != sizes[axis] for axis, given in counts.items()):
@@ -360,6 +410,12 @@ def _parameter(arrays: Mapping[str, Any], name: str, about: dict[str, Any], came
         _checked(about["refined"], bool),
         **tensors,
     )
+
+
+def _world(about: dict[str, Any]) -> World:
+    texts = {name: _checked(about[name], str) for name in ("name", "origin", "axes")}
+    optional = {"up": str, "vertical_std_deg": float, "floor_std_m": float}
+    return World(**texts, **{name: _checked(about[name], kind | None) for name, kind in optional.items()})
 
 
 def _stage_as_plain(stage: StageRecord) -> dict[str, Any]:

@@ -9,17 +9,35 @@ from typing import Any, NoReturn
 from torchstickcal.cli.benchmark import benchmark
 from torchstickcal.cli.calibrate import calibrate_session
 from torchstickcal.cli.calibrate_many import calibrate_sessions
+from torchstickcal.cli.convert import convert
 from torchstickcal.cli.evaluate import evaluate
+from torchstickcal.cli.info import info
 from torchstickcal.cli.listing import LISTS, list_names
 from torchstickcal.cli.outputs import EXIT_UNUSABLE
+from torchstickcal.cli.sample import sample
 from torchstickcal.cli.simulate import demo, simulate
+from torchstickcal.cli.triangulate import triangulate_session
 
 
 class _Parser(argparse.ArgumentParser):
     """A parser whose errors are one line, as those of the commands."""
 
+    def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:  # pyright: ignore[reportIncompatibleMethodOverride]
+        """Parse arguments; ``--world points FILE`` is one option with one value."""
+        return super().parse_known_args(None if args is None else _with_files_of_worlds(list(args)), namespace)
+
     def error(self, message: str) -> NoReturn:
         self.exit(EXIT_UNUSABLE, f"error: {' '.join(message.split())}; `{self.prog} --help` shows what there is\n")
+
+
+def _with_files_of_worlds(words: list[str]) -> list[str]:
+    """Arguments in which the kind of a frame of the world and its file are one word."""
+    joined: list[str] = []
+    while words:
+        joined.append(words.pop(0))
+        if joined[-1] == "--world" and len(words) > 1 and words[0] in ("points", "calibration"):
+            joined.append(f"{words.pop(0)} {words.pop(0)}")
+    return joined
 
 
 def _path(text: str) -> Path:
@@ -34,7 +52,19 @@ def parser() -> argparse.ArgumentParser:
         description="Calibrate a camera rig, in metres, from an athlete's keypoints and a stick of known length.",
     )
     commands = parser.add_subparsers(metavar="COMMAND", required=True)
-    for add in (_add_calibrate, _add_calibrate_many, _add_evaluate, _add_benchmark, _add_simulate, _add_demo, _add_list):
+    for add in (
+        _add_calibrate,
+        _add_calibrate_many,
+        _add_triangulate,
+        _add_info,
+        _add_convert,
+        _add_sample,
+        _add_evaluate,
+        _add_benchmark,
+        _add_simulate,
+        _add_demo,
+        _add_list,
+    ):
         add(commands)
     return parser
 
@@ -49,7 +79,11 @@ def _add_calibrate(commands: Any) -> None:
     _add_given(command)
     _add_config(command)
     _add_refining(command)
-    _add_export(command)
+    _add_outputs(command)
+    command.add_argument(
+        "--initial", metavar="FILE", type=_path, help="calibration from whose poses to start; they may be up to scale"
+    )
+    _add_units(command)
     command.add_argument("--tensorboard", metavar="DIR", type=_path, help="write a TensorBoard log of the calibration")
     _add_plugin(command)
     command.set_defaults(run=calibrate_session)
@@ -83,7 +117,8 @@ def _add_calibrate_many(commands: Any) -> None:
     _add_given(command)
     _add_config(command)
     _add_refining(command)
-    _add_export(command)
+    _add_outputs(command)
+    _add_units(command)
     _add_plugin(command)
     command.set_defaults(run=calibrate_sessions)
 
@@ -98,13 +133,82 @@ def _add_evaluate(commands: Any) -> None:
     )
     _add_format(command, "TRUTH, if it is a session")
     command.add_argument("--json", metavar="FILE", type=_path, help="write the errors as JSON")
-    command.add_argument(
-        "--units",
-        choices=("m", "cm", "mm"),
-        help="unit of length of a calibration file that does not say it (aniposelib, COLMAP)",
-    )
+    _add_units(command)
     _add_plugin(command)
     command.set_defaults(run=evaluate)
+
+
+def _add_triangulate(commands: Any) -> None:
+    command = commands.add_parser(
+        "triangulate",
+        help="find the points of a recording by cameras that were calibrated before",
+        description="Find the points of a recording, in metres, by cameras that were calibrated before and not moved since.",
+    )
+    command.add_argument(
+        "session", metavar="SESSION", type=_path, nargs="+", help="file or folder of a recording; or one file for each camera"
+    )
+    command.add_argument(
+        "--calibration",
+        metavar="DIR|FILE",
+        type=_path,
+        required=True,
+        help="folder that `calibrate` wrote, or a calibration file of any format",
+    )
+    _add_out(command, "results")
+    _add_format(command, "SESSION")
+    _add_recording(command)
+    _add_config(command)
+    command.add_argument("--no-sync", action="store_true", help="do not estimate clocks: the cameras are synchronised")
+    _add_write(command, "points: trc, c3d, csv, npz (default: npz);")
+    _add_units(command)
+    _add_plugin(command)
+    command.set_defaults(run=triangulate_session, intrinsics=None)
+
+
+def _add_info(commands: Any) -> None:
+    command = commands.add_parser(
+        "info",
+        help="show what a recording holds",
+        description="Show what a recording holds: cameras, frames, which camera sees which point how often, which pairs of "
+        "cameras see the same, and how precise a calibration would be.",
+    )
+    command.add_argument(
+        "session", metavar="SESSION", type=_path, nargs="+", help="file or folder of a session; or one file for each camera"
+    )
+    _add_format(command, "SESSION")
+    _add_given(command)
+    command.add_argument("--json", metavar="FILE", type=_path, help="write the same as JSON")
+    _add_plugin(command)
+    command.set_defaults(run=info)
+
+
+def _add_convert(commands: Any) -> None:
+    command = commands.add_parser(
+        "convert",
+        help="write a calibration in the format of another program",
+        description="Write a calibration, or the points of a folder of results, in the format of another program.",
+    )
+    command.add_argument(
+        "source", metavar="SOURCE", type=_path, help="folder that `calibrate` wrote, or a calibration file of any format"
+    )
+    command.add_argument(
+        "target", metavar="TARGET", type=_path, help="file to be written (a folder for COLMAP, EasyMocap, OpenCap and OpenCV)"
+    )
+    command.add_argument("--from", metavar="NAME", help="format of SOURCE (default: recognised by the content)")
+    command.add_argument("--to", metavar="NAME", help="format of TARGET (default: by its name)")
+    _add_units(command)
+    _add_plugin(command)
+    command.set_defaults(run=convert)
+
+
+def _add_sample(commands: Any) -> None:
+    command = commands.add_parser(
+        "sample",
+        help="write a small recording to try the other commands with",
+        description="Write a small recording: a golf swing seen by four cameras, as OpenPose and Pose2Sim write it.",
+    )
+    command.add_argument("folder", metavar="FOLDER", type=_path, help="where to; created if it does not exist")
+    command.set_defaults(run=sample, plugin=())
 
 
 def _add_benchmark(commands: Any) -> None:
@@ -189,7 +293,31 @@ def _add_format(command: argparse.ArgumentParser, what: str) -> None:
     command.add_argument("--format", metavar="NAME", help=help)
 
 
+def _add_write(command: argparse.ArgumentParser, what: str) -> None:
+    command.add_argument(
+        "--write",
+        metavar="A,B",
+        help=f"write {what} in these formats, from `torchstickcal list formats`, or into files whose names say their formats",
+    )
+
+
+def _add_units(command: argparse.ArgumentParser) -> None:
+    command.add_argument(
+        "--units",
+        choices=("m", "cm", "mm"),
+        help="unit of length of a calibration file that does not say it (aniposelib, COLMAP)",
+    )
+
+
 def _add_given(command: argparse.ArgumentParser) -> None:
+    """What the files of a detector do not say, of lenses too."""
+    _add_recording(command)
+    command.add_argument(
+        "--intrinsics", metavar="FILE", type=_path, help="calibration of which the intrinsics are used (default: the session's)"
+    )
+
+
+def _add_recording(command: argparse.ArgumentParser) -> None:
     """What the files of a detector do not say."""
     add = command.add_argument
     add(
@@ -202,9 +330,7 @@ def _add_given(command: argparse.ArgumentParser) -> None:
     add(
         "--stick-points", metavar="PATH", type=_path, help="keypoints of the stick's ends, where they are in files of their own"
     )
-    add(
-        "--intrinsics", metavar="FILE", type=_path, help="calibration of which the intrinsics are used (default: the session's)"
-    )
+    add("--turned", choices=("left", "right", "back"), help="images were turned so after the calibration: left, right, or back")
     add("--image-size", metavar=("WIDTH", "HEIGHT"), type=float, nargs=2, help="size of the images, pixels")
     add("--fps", metavar="HZ", type=float, help="frames per second")
     add("--skeleton", metavar="NAME|FILE.toml", help="names of the points (default: by their number)")
@@ -236,9 +362,17 @@ def _add_refining(command: argparse.ArgumentParser) -> None:
     )
 
 
-def _add_export(command: argparse.ArgumentParser) -> None:
+def _add_outputs(command: argparse.ArgumentParser) -> None:
+    """What is written, and in which frame."""
+    _add_write(command, "the calibration and its points also")
+    command.add_argument("--export", metavar="A,B", help="as --write")
     command.add_argument(
-        "--export", metavar="A,B", help="write the calibration also in these formats, from `torchstickcal list formats`"
+        "--world",
+        metavar="camera|athlete|floor|points FILE|calibration FILE",
+        default="athlete",
+        help="frame of the results: of the first camera; of the athlete: z up, the origin on the floor below the feet at "
+        "first, x where the athlete faces; of the floor: z up, the origin below the first camera; of points at known places "
+        "(.csv); of another calibration of the same cameras (default: athlete, where head and ankles are known)",
     )
 
 

@@ -9,12 +9,13 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from torchstickcal.cli.outputs import chosen_writers, result_names, show_results, write_results
+from torchstickcal.cli.outputs import check_frame_rate, chosen_writers, result_names, show_results, write_results
+from torchstickcal.cli.world import placed, world_of
 from torchstickcal.errors import CalibrationError
 
 if TYPE_CHECKING:
     from torchstickcal.config import Config
-    from torchstickcal.io import Given
+    from torchstickcal.io import Given, Rig
     from torchstickcal.observations import Observations
     from torchstickcal.pipeline.calibrate import Callback
     from torchstickcal.result import Calibration
@@ -28,21 +29,26 @@ def calibrate_session(options: argparse.Namespace) -> int:
     from torchstickcal.pipeline.calibrate import calibrate
 
     config, refine = _refining(load_config(options.config), options.refine, options.no_sync)
-    writers = chosen_writers(options.export)
+    writers, world = chosen_writers(options.export, options.write), world_of(options.world, options.units)
+    initial = initial_of(options.initial)
     try_writing(options.out, result_names(writers))
     if options.tensorboard is not None:
         try_writing(options.tensorboard, where="--tensorboard")
-    session = load_session(options.session, options.format, _given(options))
+    session = load_session(options.session, options.format, given_of(options))
     for note in session.notes:
         print(f"note: {note}", file=sys.stderr)
     observations = _with_stick(session.observations, options.stick_length, options.stick_sigma)
-    calibration = calibrate(observations, config, Progress(_monitor(options.tensorboard)), refine)
+    check_frame_rate(writers, observations)
+    calibration = calibrate(observations, config, Progress(_monitor(options.tensorboard)), refine, initial=initial)
+    calibration, sentences = placed(calibration, world)
+    for sentence in sentences:
+        print(f"note: {sentence}", file=sys.stderr)
     with atomic_set(options.out) as folder:
-        write_results(calibration, folder, writers, _provenance(options, session.notes))
+        write_results(calibration, folder, writers, _provenance(options, [*session.notes, *sentences]))
     return show_results(calibration, options.out, writers)
 
 
-def _given(options: argparse.Namespace) -> Given:
+def given_of(options: argparse.Namespace) -> Given:
     """What the options say of a recording.
 
     Raises:
@@ -60,7 +66,15 @@ def _given(options: argparse.Namespace) -> Given:
         skeleton=options.skeleton,
         person=options.person,
         stick_points=None if options.stick_points is None else read_recording(options.stick_points),
+        turned=options.turned,
     )
+
+
+def initial_of(path: Path | None) -> Calibration | Rig | None:
+    """The calibration from whose poses another one starts."""
+    from torchstickcal.io.results import read_result
+
+    return None if path is None else read_result(path)
 
 
 def _end(text: str) -> int | str:

@@ -12,6 +12,7 @@ from torchstickcal.errors import CalibrationError
 if TYPE_CHECKING:
     from torchstickcal.io import Writer
     from torchstickcal.metrics import PoseErrors
+    from torchstickcal.observations import Observations
     from torchstickcal.result import Calibration
 
 EXIT_DONE, EXIT_NOT_CONVERGED, EXIT_UNUSABLE, EXIT_INTERRUPTED = 0, 1, 2, 130
@@ -19,29 +20,85 @@ CAMERAS_FORMAT = "pose2sim"
 CAMERAS_FILE, POINTS_FILE, REPORT_FILE = "calibration.toml", "points.npz", "report.json"
 
 
-def chosen_writers(names: str | None) -> dict[str, Writer]:
-    """The writers of the camera file and of further formats, by the names of the files that they write.
+def chosen_writers(export: str | None = None, write: str | None = None) -> dict[str, Writer]:
+    """The writers of the camera file and of further outputs, by the names of the files (or folders) that they write.
+
+    Args:
+        export: names of formats, or of files whose names say their formats, with commas.
+        write: the same.
 
     Raises:
         CalibrationError: for an unknown format, or if two files have the same name.
     """
-    from torchstickcal.io import CALIBRATION_WRITERS
+    chosen = {CAMERAS_FORMAT: "--write"}
+    for option, names in (("--export", export), ("--write", write)):
+        chosen |= dict.fromkeys(names.split(",") if names else (), option)
+    return _distinct(chosen, {POINTS_FILE, REPORT_FILE})
 
-    writers: dict[str, Writer] = {}
-    further = names.split(",") if names else []
-    for name in dict.fromkeys([CAMERAS_FORMAT, *further]):
-        writer = CALIBRATION_WRITERS[name]
-        if writer.file_name in {*writers, POINTS_FILE, REPORT_FILE}:
+
+def point_writers(names: str | None) -> dict[str, Writer]:
+    """The writers of points, as :func:`chosen_writers`; that of arrays where none are named.
+
+    Raises:
+        CalibrationError: also for a format that does not hold points.
+    """
+    writers = _distinct(dict.fromkeys(names.split(",") if names else ["npz"], "--write"), {REPORT_FILE})
+    for name, writer in writers.items():
+        if writer.writes != "points":
             raise CalibrationError(
-                "two files of one name", where=f"--export {name}", got=writer.file_name, expected="another file name"
+                "a format that does not hold points", where="--write", got=name, expected="such as trc, c3d, csv or npz"
             )
-        writers[writer.file_name] = writer
     return writers
 
 
+def _distinct(names: dict[str, str], taken: set[str]) -> dict[str, Writer]:
+    """Writers by the names of their files, of formats or files and the options that ask for them.
+
+    Raises:
+        CalibrationError: for an unknown format, for a file elsewhere, or if two files have the same name.
+    """
+    from torchstickcal.cli.convert import writer_of
+    from torchstickcal.io import CALIBRATION_WRITERS
+
+    writers: dict[str, Writer] = {}
+    for name, option in names.items():
+        if name not in CALIBRATION_WRITERS and "." in name:
+            if Path(name).name != name:
+                expected = "the name of a file alone, which is written to the folder of the results"
+                raise CalibrationError("a file in another folder", where=option, got=name, expected=expected)
+            file_name, writer = writer_of(name)
+        else:
+            writer = CALIBRATION_WRITERS[name]
+            file_name = writer.file_name
+        if file_name.lower() in {other.lower() for other in (*writers, *taken)}:
+            expected = "another file name"
+            raise CalibrationError("two files of one name", where=f"{option} {name}", got=file_name, expected=expected)
+        writers[file_name] = writer
+    return writers
+
+
+def check_frame_rate(writers: dict[str, Writer], observations: Observations) -> None:
+    """Refuse, before anything is calculated, a recording without a frame rate for formats that need one.
+
+    Raises:
+        CalibrationError: if it is one.
+    """
+    if observations.fps is not None or observations.timestamps is not None:
+        return
+    for name, writer in writers.items():
+        if writer.needs_rate:
+            raise CalibrationError(
+                "a format that needs a frame rate",
+                where=name,
+                got="a recording without one",
+                expected="frames per second",
+                remedy="Give it with --fps.",
+            )
+
+
 def result_names(writers: dict[str, Writer]) -> list[str]:
-    """The names of the files that :func:`write_results` writes."""
-    return [*writers, POINTS_FILE, REPORT_FILE]
+    """The names of the single files that :func:`write_results` writes; folders of several files are not among them."""
+    return [*(name for name, writer in writers.items() if not writer.files), POINTS_FILE, REPORT_FILE]
 
 
 def write_results(calibration: Calibration, folder: Path, writers: dict[str, Writer], provenance: dict[str, Any]) -> None:
@@ -58,7 +115,7 @@ def show_results(calibration: Calibration, folder: Path, writers: dict[str, Writ
     from torchstickcal.show.report import table
 
     print(table(calibration))
-    print(f"\n{', '.join(result_names(writers))} in {folder}")
+    print(f"\n{', '.join([*writers, POINTS_FILE, REPORT_FILE])} in {folder}")
     if calibration.converged:
         return EXIT_DONE
     print(f"not converged: {calibration.status}", file=sys.stderr)

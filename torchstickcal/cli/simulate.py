@@ -45,7 +45,7 @@ def demo(options: argparse.Namespace) -> int:
     from torchstickcal.show.rig import rig_figure
     from torchstickcal.simulate import Noise, golf_session
 
-    writers = chosen_writers(None)
+    writers = chosen_writers()
     try_writing(options.out, ["session.npz", "rig.png", *result_names(writers)])
     print(
         "A golf swing seen by 6 cameras: 240 frames, 1.5 px noise, 15 % of the keypoints missing, 5 % wrong by up to 150 px.\n"

@@ -55,6 +55,14 @@ def raised(entries: Tensor, damping: Tensor | float) -> Tensor:
     return raised
 
 
+def are_definite(entries: Tensor) -> Tensor:
+    """Whether all of some matrices (..., 6, N) are positive definite, (...)."""
+    xx, xy, xz, yy, yz, zz = entries.unbind(-2)
+    minor = xx * yy - xy * xy
+    determinant = zz * minor - xx * yz * yz - yy * xz * xz + 2 * xy * xz * yz
+    return ((xx > 0) & (minor > 0) & (determinant > 0)).all(-1)
+
+
 def cholesky(entries: Tensor) -> Tensor:
     """Factors (..., 6, N) as 1/l00 l10 l20 1/l11 l21 1/l22; pivots are kept above rounding."""
     floor = _RELATIVE_PIVOT_FLOOR[entries.dtype]

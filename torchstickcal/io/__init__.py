@@ -9,31 +9,36 @@ Example:
 from torchstickcal.io.camera_toml import read_camera_toml, write_camera_toml
 from torchstickcal.io.formats import (
     CALIBRATION_READERS,
-    CALIBRATION_WRITERS,
     KEYPOINT_READERS,
     SESSION_READERS,
     Reader,
     Session,
-    Writer,
     calibration_reader,
-    calibration_writer,
     camera_reader,
     find_reader,
     keypoint_reader,
     read_calibration,
     reading,
     session_reader,
-    write_calibration,
 )
 from torchstickcal.io.given import Given, complete
+from torchstickcal.io.motion import Motion
 from torchstickcal.io.movement import recording_of_movement
 from torchstickcal.io.npz import read_npz, write_npz
 from torchstickcal.io.recording import Detection, Recording, View
 from torchstickcal.io.rig import Rig, RigCamera
 from torchstickcal.io.sessions import LoadedSession, load_session, read_recording, read_session
-from torchstickcal.io.skeletons import SKELETONS
-from torchstickcal.io.sports_stick_syn import SPORTS_STICK_SYN_JOINTS, read_sports_stick_syn
+from torchstickcal.io.sports_stick_syn import read_sports_stick_syn
 from torchstickcal.io.truth import Truth
+from torchstickcal.io.writers import (
+    CALIBRATION_WRITERS,
+    Writer,
+    calibration_writer,
+    camera_writer,
+    point_writer,
+    write_calibration,
+)
+from torchstickcal.skeletons import SKELETONS, SPORTS_STICK_SYN_JOINTS
 
 __all__ = [
     "CALIBRATION_READERS",
@@ -45,6 +50,7 @@ __all__ = [
     "Detection",
     "Given",
     "LoadedSession",
+    "Motion",
     "Reader",
     "Recording",
     "Rig",
@@ -56,10 +62,12 @@ __all__ = [
     "calibration_reader",
     "calibration_writer",
     "camera_reader",
+    "camera_writer",
     "complete",
     "find_reader",
     "keypoint_reader",
     "load_session",
+    "point_writer",
     "read_calibration",
     "read_camera_toml",
     "read_npz",

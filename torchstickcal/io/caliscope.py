@@ -8,8 +8,10 @@ from typing import Any
 
 import numpy as np
 
-from torchstickcal.io.formats import calibration_reader, keypoint_reader, reading
-from torchstickcal.io.recording import Detection, Recording, View
+from torchstickcal.io.about import about
+from torchstickcal.io.camera_toml import camera_table, quoted, write_tables
+from torchstickcal.io.formats import calibration_reader, camera_writer, keypoint_reader, reading
+from torchstickcal.io.recording import Detection, Recording, View, last_number
 from torchstickcal.io.rig import Rig, RigCamera
 from torchstickcal.untrusted import read_rows, read_toml
 
@@ -57,9 +59,25 @@ def read_caliscope_cameras(path: str | Path) -> Rig:
         return Rig.of([_camera(key, table) for key, table in read_toml(path)["cameras"].items()])
 
 
+@camera_writer("caliscope", "cameras of Caliscope, in metres (.toml)", file_name="camera_array.toml")
+def write_caliscope(path: Path, rig: Rig) -> None:
+    """Write the cameras. Their numbers are those in their names, if each has one of its own; else they are counted."""
+    numbers = [last_number(name) for name in rig.names]
+    if None in numbers or len(set(numbers)) != len(numbers):
+        numbers = list(range(len(rig.names)))
+    tables = []
+    for camera, number in enumerate(numbers):
+        table = camera_table(rig, camera)
+        table |= {"cam_id": number, "size": list(map(round, rig.size(camera))), "rotation_count": 0}
+        table |= {"distortions": rig.coefficients(camera, 5, 5, "Caliscope"), "fisheye": str(rig.fisheye[camera]).lower()}
+        tables.append((f"cameras.{number}", table))
+    metadata = {key: quoted(text) for key, text in about("metres", rig.world).items()}
+    write_tables(path, tables, metadata)
+
+
 def _camera(key: str, table: dict[str, Any]) -> RigCamera:
     return RigCamera(
-        name=f"cam_{table.get('cam_id', table.get('port', key))}",
+        name=str(table.get("name", f"cam_{table.get('cam_id', table.get('port', key))}")),
         matrix=table["matrix"],
         distortion=table["distortions"],
         fisheye=bool(table.get("fisheye", False)),

@@ -8,16 +8,18 @@ of FreeMoCap, and a unit that the file does not say in those of aniposelib. Both
 from __future__ import annotations
 
 import json
+import math
 import re
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, TypeVar
 
 import cv2
-import torch
 from torch import Tensor
 
 from torchstickcal.files import atomic_path, check_text
-from torchstickcal.io.formats import calibration_reader, calibration_writer, reading
+from torchstickcal.io.about import about
+from torchstickcal.io.formats import calibration_reader, camera_writer, reading
 from torchstickcal.io.rig import METRES, Rig, RigCamera, as_float64
 from torchstickcal.result import Calibration
 from torchstickcal.shapes import check_shapes
@@ -30,11 +32,13 @@ _CAMERA_TABLE = re.compile(rb"^(?:\xef\xbb\xbf)?\[[^\[\].]+\]\s*\n(?:(?!\[).*\n)
 """A top-level table with a camera matrix."""
 _COEFFICIENTS = 4
 """Number of distortion coefficients that Pose2Sim writes."""
+_MOST_COEFFICIENTS = 14
+"""Number of distortion coefficients that OpenCV, which these programs use, knows."""
 _Value = TypeVar("_Value")
 
 
-@calibration_writer(_NAME, _DESCRIPTION, file_name="calibration.toml")
-def write_camera_toml(path: str | Path, calibration: Calibration) -> None:
+@camera_writer(_NAME, _DESCRIPTION, file_name="calibration.toml")
+def write_camera_toml(path: str | Path, calibration: Calibration | Rig) -> None:
     """Write the cameras of a calibration for Pose2Sim and aniposelib.
 
     The distortion coefficients of a camera are written in OpenCV's order: those of the calibration, with zeros up to 5 of
@@ -42,7 +46,7 @@ def write_camera_toml(path: str | Path, calibration: Calibration) -> None:
 
     Args:
         path: of the file.
-        calibration: the calibration.
+        calibration: the calibration, or its cameras.
 
     Raises:
         CalibrationError: if a camera has a name that no file can hold.
@@ -60,13 +64,81 @@ def write_camera_toml(path: str | Path, calibration: Calibration) -> None:
         >>> bool((rig.translations == calibration.translations).all())
         True
     """
-    for name in calibration.camera_names:
-        check_text(name, "camera_names")
-    count = len(calibration.camera_names)
-    names = [f"cam_{number:0{len(str(count - 1))}d}" for number in range(count)]
-    tables = [f"[{name}]\n{_camera(calibration, number)}" for number, name in enumerate(names)]
+    rig = calibration if isinstance(calibration, Rig) else Rig.of_calibration(calibration)
+    tables = [
+        (key, camera_table(rig, camera) | {"fisheye": str(rig.fisheye[camera]).lower()})
+        for camera, key in enumerate(table_names(rig))
+    ]
+    write_tables(path, tables, {"adjusted": "false", "error": _number(rig.error_px), **_about("m", "metres", rig)})
+
+
+@camera_writer("anipose", "cameras of aniposelib and Anipose, in metres (.toml)", file_name="anipose.toml")
+def write_anipose(path: Path, rig: Rig) -> None:
+    """Write the cameras for aniposelib, which knows lenses of up to 5 coefficients."""
+    lenses = [rig.coefficients(camera, 5, 5, "aniposelib") for camera in range(len(rig.names))]
+    tables = [
+        (key, camera_table(rig, camera) | {"distortions": lenses[camera], "fisheye": str(rig.fisheye[camera]).lower()})
+        for camera, key in enumerate(table_names(rig))
+    ]
+    write_tables(path, tables, {"adjusted": "false", "error": _number(rig.error_px), **_about("m", "metres", rig)})
+
+
+@camera_writer("freemocap", "cameras of FreeMoCap, in millimetres (.toml)", file_name="freemocap_camera_calibration.toml")
+def write_freemocap(path: Path, rig: Rig) -> None:
+    """Write the cameras for FreeMoCap: lengths in millimetres, and where each camera is in the world."""
+    rig.check_plain("FreeMoCap", fisheye=False)
+    rotations, translations = rig.in_metres().poses()
+    tables = []
+    for camera, name in enumerate(rig.names):
+        centre = -rotations[camera].mT @ translations[camera] / METRES["mm"]
+        table = camera_table(rig, camera, "mm") | {
+            "id": quoted(name),
+            "index": camera,
+            "distortions": rig.coefficients(camera, 5, 5, "FreeMoCap"),
+            "world_orientation": rotations[camera].mT.tolist(),
+            "world_position": centre.tolist(),
+        }
+        tables.append((quoted(name), table))
+    more = {"reprojection_error_px": _number(rig.error_px)}
+    write_tables(path, tables, more | _about("mm", "millimetres", rig))
+
+
+def write_tables(path: str | Path, tables: Sequence[tuple[str, Mapping[str, object]]], metadata: Mapping[str, object]) -> None:
+    """Write the tables of cameras, by their keys, and one of metadata, whose values are as TOML writes them."""
+    texts = (
+        f"[{key}]\n" + "".join(f"{name} = {value}\n" for name, value in table.items())
+        for key, table in [*tables, ("metadata", metadata)]
+    )
     with atomic_path(path) as temporary:
-        temporary.write_text("\n".join([*tables, _metadata(calibration)]), "utf-8")
+        temporary.write_text("\n".join(texts), "utf-8")
+
+
+def table_names(rig: Rig) -> list[str]:
+    """Keys for the tables of cameras that sort as text in the order of the cameras.
+
+    Raises:
+        CalibrationError: if a camera has a name that no file can hold.
+    """
+    for name in rig.names:
+        check_text(name, "camera_names")
+    count = len(rig.names)
+    return [f"cam_{number:0{len(str(count - 1))}d}" for number in range(count)]
+
+
+def camera_table(rig: Rig, camera: int, unit: str = "m") -> dict[str, object]:
+    """What the files of all these programs say of a camera, as TOML writes it. No pose where none is known."""
+    table: dict[str, object] = {
+        "name": quoted(rig.names[camera]),
+        "size": rig.size(camera),
+        "matrix": rig.intrinsics[camera].tolist(),
+        "distortions": rig.coefficients(camera, 5, _MOST_COEFFICIENTS, "calibration"),
+    }
+    if rig.rotations is None:
+        return table
+    rotations, translations = rig.poses()
+    rotation, _ = cv2.Rodrigues(rotations[camera].numpy())
+    translation = translations[camera] / METRES[unit]
+    return table | {"rotation": rotation[:, 0].tolist(), "translation": translation.tolist()}
 
 
 @calibration_reader(_NAME, _DESCRIPTION, recognises=lambda path, head: _CAMERA_TABLE.search(head) is not None)
@@ -145,32 +217,13 @@ def _unit(cameras: dict[str, Any], metadata: dict[str, Any]) -> str | None:
     return "m" if pose2sim else None
 
 
-def _camera(calibration: Calibration, index: int) -> str:
-    """The lines of a camera's table."""
-    matrix = calibration.intrinsics[index].double().cpu()
-    size = 2 * matrix[:2, 2] if calibration.image_size is None else calibration.image_size[index].double().cpu()
-    rotation, _ = cv2.Rodrigues(calibration.rotations[index].double().cpu().numpy())
-    values = {
-        "name": _quoted(calibration.camera_names[index]),
-        "size": size.tolist(),
-        "matrix": matrix.tolist(),
-        "distortions": _distortion(calibration, index).tolist(),
-        "rotation": rotation[:, 0].tolist(),
-        "translation": calibration.translations[index].double().cpu().tolist(),
-        "fisheye": str(calibration.fisheye).lower(),
-    }
-    return "".join(f"{key} = {value}\n" for key, value in values.items())
+def _about(unit: str, words: str, rig: Rig) -> dict[str, str]:
+    said = {key: quoted(text) for key, text in about(words, rig.world).items()}
+    return said | {"units": quoted(unit)}
 
 
-def _distortion(calibration: Calibration, index: int) -> Tensor:
-    """The distortion coefficients of a camera, (4,) for a fisheye lens, else (D,) with D of 5 or more."""
-    given = torch.zeros(5) if calibration.distortion is None else calibration.distortion[index].double().cpu()
-    return given if calibration.fisheye else torch.nn.functional.pad(given, (0, max(0, 5 - len(given))))
-
-
-def _metadata(calibration: Calibration) -> str:
-    error = float(calibration.reprojection_median_px.mean())
-    return f'[metadata]\nadjusted = false\nerror = {error!r}\nunits = "m"\ngenerator = "torchstickcal"\n'
+def _number(value: float | None) -> float:
+    return 0.0 if value is None or not math.isfinite(value) else value
 
 
 def _given(camera: dict[str, Any], key: str, kind: type[_Value], default: _Value) -> _Value:
@@ -181,6 +234,6 @@ def _given(camera: dict[str, Any], key: str, kind: type[_Value], default: _Value
     return value
 
 
-def _quoted(name: str) -> str:
+def quoted(name: str) -> str:
     """A text as TOML: JSON, with the one character escaped that JSON allows and TOML does not."""
     return json.dumps(name, ensure_ascii=False).replace("\x7f", "\\u007f")

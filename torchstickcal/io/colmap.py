@@ -9,8 +9,11 @@ from pathlib import Path, PurePosixPath
 import numpy as np
 from numpy.typing import NDArray
 
-from torchstickcal.io.formats import HEAD_BYTES, calibration_reader, reading
+from torchstickcal.files import atomic_set
+from torchstickcal.io.about import about, comments
+from torchstickcal.io.formats import HEAD_BYTES, calibration_reader, camera_writer, reading
 from torchstickcal.io.rig import Rig, RigCamera
+from torchstickcal.io.writers import file_names
 from torchstickcal.untrusted import read_head, read_text
 
 _DESCRIPTION = "cameras of COLMAP: a folder with cameras.txt and images.txt"
@@ -51,6 +54,57 @@ def read_colmap(path: str | Path) -> Rig:
             return Rig.of([_camera(name, lenses[lens], *pose) for name, lens, *pose in poses], None)
         named = {lens: name for name, lens, *_ in poses}
         return Rig.of([_camera(named.get(number, f"cam_{number}"), values) for number, values in lenses.items()], None)
+
+
+@camera_writer(
+    "colmap",
+    "cameras of COLMAP as text, in metres",
+    file_name="colmap",
+    files=("cameras.txt", "images.txt", "points3D.txt"),
+)
+def write_colmap(path: Path, rig: Rig) -> None:
+    """Write ``cameras.txt``, ``images.txt`` and an empty ``points3D.txt`` into a folder. The image of a camera is NAME.png."""
+    rig.check_plain("COLMAP")
+    rotations, translations = rig.in_metres().poses()
+    head = comments(about("metres", rig.world, "x_camera = R x_world + t; the corner of the image is at (0, 0)."))
+    cameras = f"{head}# CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]\n"
+    images = f"{head}# IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME\n# POINTS2D[] as (X, Y, POINT3D_ID)\n"
+    for camera, name in enumerate(file_names(rig.names)):
+        model, parameters = _model(rig, camera)
+        width, height = map(round, rig.size(camera))
+        cameras += f"{camera + 1} {model} {width} {height} {_numbers(parameters)}\n"
+        pose = [*_quaternion(rotations[camera].numpy()), *translations[camera].tolist()]
+        images += f"{camera + 1} {_numbers(pose)} {camera + 1} {name}.png\n\n"
+    with atomic_set(path) as folder:
+        for file, text in (("cameras.txt", cameras), ("images.txt", images), ("points3D.txt", head)):
+            (folder / file).write_text(text, "utf-8")
+
+
+def _model(rig: Rig, camera: int) -> tuple[str, list[float]]:
+    """The model of a camera and its parameters, of as few coefficients as it needs."""
+    (fx, _, cx), (_, fy, cy), _ = rig.intrinsics[camera].tolist()
+    lens = rig.coefficients(camera, 8, 8, "COLMAP")
+    pinhole = [fx, fy, cx + 0.5, cy + 0.5]
+    if rig.fisheye[camera]:
+        return "OPENCV_FISHEYE", [*pinhole, *lens]
+    return ("FULL_OPENCV", [*pinhole, *lens]) if any(lens[4:]) else ("OPENCV", [*pinhole, *lens[:4]])
+
+
+def _quaternion(rotation: NDArray[np.float64]) -> list[float]:
+    """The unit quaternion w, x, y, z of a rotation, w not negative: the eigenvector of a symmetric matrix (Bar-Itzhack)."""
+    (xx, xy, xz), (yx, yy, yz), (zx, zy, zz) = rotation.tolist()
+    symmetric = np.array([
+        [xx + yy + zz, zy - yz, xz - zx, yx - xy],
+        [zy - yz, xx - yy - zz, xy + yx, xz + zx],
+        [xz - zx, xy + yx, yy - xx - zz, yz + zy],
+        [yx - xy, xz + zx, yz + zy, zz - xx - yy],
+    ])  # fmt: skip
+    vector = np.linalg.eigh(symmetric)[1][:, -1]
+    return (vector * (-1.0 if vector[0] < 0 else 1.0)).tolist()
+
+
+def _numbers(values: Sequence[float]) -> str:
+    return " ".join(map(repr, values))
 
 
 def camera_of_image(name: str) -> str:

@@ -2,17 +2,29 @@
 
 from __future__ import annotations
 
+import json
 import re
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 
-from torchstickcal.io.formats import HEAD_BYTES, KEYPOINT_READERS, calibration_reader, camera_reader, keypoint_reader, reading
-from torchstickcal.io.opencv import matrix_of
+from torchstickcal.files import atomic_set
+from torchstickcal.io.formats import (
+    HEAD_BYTES,
+    KEYPOINT_READERS,
+    calibration_reader,
+    camera_reader,
+    camera_writer,
+    keypoint_reader,
+    reading,
+)
+from torchstickcal.io.opencv import matrix_of, storage_head, storage_matrix
 from torchstickcal.io.recording import Detection, Recording, View, frame_files, in_folder
 from torchstickcal.io.rig import Rig, RigCamera
+from torchstickcal.io.writers import file_names
 from torchstickcal.untrusted import read_head, read_json, read_yaml
 
 _CAMERAS = "cameras of EasyMocap: a folder with intri.yml and extri.yml, or intri.yml alone"
@@ -73,6 +85,27 @@ def read_easymocap_cameras(path: str | Path) -> Rig:
         extrinsics = read_yaml(poses) if poses.is_file() else {}
         names = [key.removeprefix("K_") for key in intrinsics if key.startswith("K_")]  # `names` may have lost its zeros
         return Rig.of([_camera(name, intrinsics, extrinsics) for name in names])
+
+
+@camera_writer("easymocap", "cameras of EasyMocap, in metres", file_name="easymocap", files=("intri.yml", "extri.yml"))
+def write_easymocap(path: Path, rig: Rig) -> None:
+    """Write ``intri.yml`` and ``extri.yml`` into a folder."""
+    rig.check_plain("EasyMocap", fisheye=False)
+    keys = file_names([name.replace(":", "_") for name in rig.names])
+    listed = "names:\n" + "".join(f"  - {json.dumps(key)}\n" for key in keys)
+    intrinsics = extrinsics = storage_head(rig, "x_camera = Rot x_world + T.") + listed
+    rotations, translations = rig.in_metres().poses()
+    for camera, key in enumerate(keys):
+        width, height = map(round, rig.size(camera))
+        intrinsics += storage_matrix(f"K_{key}", rig.intrinsics[camera].numpy())
+        intrinsics += storage_matrix(f"dist_{key}", [rig.coefficients(camera, 5, 5, "EasyMocap")])
+        intrinsics += f"H_{key}: {height}\nW_{key}: {width}\n"
+        rotation = rotations[camera].numpy()
+        extrinsics += storage_matrix(f"R_{key}", cv2.Rodrigues(rotation)[0]) + storage_matrix(f"Rot_{key}", rotation)
+        extrinsics += storage_matrix(f"T_{key}", translations[camera][:, None].numpy())
+    with atomic_set(path) as folder:
+        (folder / "intri.yml").write_text(intrinsics, "utf-8")
+        (folder / "extri.yml").write_text(extrinsics, "utf-8")
 
 
 def _camera(name: str, intrinsics: Mapping[str, Any], extrinsics: Mapping[str, Any]) -> RigCamera:

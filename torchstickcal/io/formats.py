@@ -1,7 +1,7 @@
-"""File formats by name: readers of sessions, of detectors' keypoints and of calibrations, writers of calibrations.
+"""File formats by name: readers of sessions, of detectors' keypoints and of calibrations. Writers are in ``writers.py``.
 
 A new format is one decorated function, in a file of this folder or in a module of your own.
-:func:`~torchstickcal.io.read_session`, :func:`read_calibration`, :func:`write_calibration` and the command line then know it.
+:func:`~torchstickcal.io.read_session`, :func:`read_calibration` and the command line then know it.
 """
 
 from __future__ import annotations
@@ -13,15 +13,22 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Generic, TypeVar
 
-from torchstickcal.errors import CalibrationError, FileFormatError
+from torchstickcal.errors import FileFormatError
 from torchstickcal.files import check_text
 from torchstickcal.io.recording import Recording, View, in_folder
 from torchstickcal.io.rig import Rig
 from torchstickcal.io.truth import Truth
+from torchstickcal.io.writers import CALIBRATION_WRITERS, Writer, calibration_writer, camera_writer, point_writer
 from torchstickcal.observations import Observations
 from torchstickcal.registry import Registry
-from torchstickcal.result import Calibration
 from torchstickcal.untrusted import read_head, reading
+
+__all__ = [
+    "CALIBRATION_READERS", "CALIBRATION_WRITERS", "HEAD_BYTES", "KEYPOINT_READERS", "SESSION_READERS", "Reader", "Session",
+    "Writer", "calibration_reader", "calibration_writer", "camera_reader", "camera_writer", "find_reader", "head_of",
+    "is_folder", "keypoint_reader", "point_writer", "read_calibration", "reader_of", "reading", "session_of", "session_reader",
+]  # fmt: skip
+"""All that a new format needs."""
 
 HEAD_BYTES = 4096
 """Number of bytes from the beginning of a file that a recogniser is given."""
@@ -79,40 +86,6 @@ class Reader(Generic[_Content]):
             return False
 
 
-@dataclass(frozen=True)
-class Writer:
-    """A file format that can be written.
-
-    Args:
-        function: writes a calibration to a path: its cameras, its points, or both.
-        file_name: name of the file that the command line writes.
-        description: the format in one line.
-    """
-
-    function: Callable[[Path, Calibration], None]
-    file_name: str
-    description: str
-
-    def write(self, path: str | Path, calibration: Calibration) -> None:
-        """Write a calibration.
-
-        Raises:
-            CalibrationError: if the function fails.
-            OSError: if the file cannot be written.
-        """
-        try:
-            self.function(Path(path), calibration)
-        except (CalibrationError, OSError):
-            raise
-        except Exception as error:
-            raise CalibrationError(
-                "a calibration cannot be written in this format",
-                where=f"{self.function.__module__}.{self.function.__name__}",
-                got=f"{type(error).__name__}: {error}",
-                expected=self.description,
-            ) from error
-
-
 SESSION_READERS: Registry[Reader[Session]] = Registry("session format", "torchstickcal.io")
 """The formats of sessions that can be read, by name. :func:`session_reader` adds one."""
 
@@ -122,14 +95,10 @@ KEYPOINT_READERS: Registry[Reader[Recording]] = Registry("session format", "torc
 CALIBRATION_READERS: Registry[Reader[Rig]] = Registry("calibration format", "torchstickcal.io")
 """The formats of calibrations that can be read, by name. :func:`calibration_reader` adds one."""
 
-CALIBRATION_WRITERS: Registry[Writer] = Registry("output format", "torchstickcal.io")
-"""The formats in which a calibration can be written, by name. :func:`calibration_writer` adds one."""
-
 _SessionFunction = TypeVar("_SessionFunction", bound=Callable[[Path], Session])
 _RecordingFunction = TypeVar("_RecordingFunction", bound=Callable[[Path], Recording])
 _ViewFunction = TypeVar("_ViewFunction", bound=Callable[[Path], View])
 _RigFunction = TypeVar("_RigFunction", bound=Callable[[Path], Rig])
-_WriterFunction = TypeVar("_WriterFunction", bound=Callable[[Path, Calibration], None])
 
 
 def session_reader(
@@ -302,41 +271,6 @@ def calibration_reader(
     return register
 
 
-def calibration_writer(
-    name: str, description: str, *, file_name: str, replace: bool = False
-) -> Callable[[_WriterFunction], _WriterFunction]:
-    """A decorator that registers a function as the writer of an output format, and returns the function unchanged.
-
-    The function is called with a path and a :class:`~torchstickcal.Calibration`, of which it writes the cameras, the points,
-    or both. It writes through :func:`torchstickcal.files.atomic_path`, so that an error leaves no incomplete file.
-
-    Args:
-        name: of the format.
-        description: the format in one line.
-        file_name: name of the file that the command line writes.
-        replace: whether to replace a format of that name.
-
-    Raises:
-        ConfigError: if the name is in use.
-
-    Example::
-
-        from torchstickcal.files import atomic_path
-        from torchstickcal.io import calibration_writer
-
-        @calibration_writer("toy", "names of the cameras, one per line", file_name="names.txt")
-        def write_toy(path, calibration):
-            with atomic_path(path) as temporary:
-                temporary.write_text("\\n".join(calibration.camera_names))
-    """
-
-    def register(function: _WriterFunction) -> _WriterFunction:
-        CALIBRATION_WRITERS.register(name, Writer(function, file_name, description), replace=replace)
-        return function
-
-    return register
-
-
 def read_calibration(path: str | Path, format: str | None = None) -> Rig:
     """Read the cameras of a calibration.
 
@@ -349,39 +283,9 @@ def read_calibration(path: str | Path, format: str | None = None) -> Rig:
         ConfigError: for an unknown format.
         FileNotFoundError: if there is no such file.
 
-    Example: see :func:`write_calibration`.
+    Example: see :func:`~torchstickcal.io.write_calibration`.
     """
     return reader_of(path, CALIBRATION_READERS, format).read(path)
-
-
-def write_calibration(path: str | Path, calibration: Calibration, format: str) -> None:
-    """Write a calibration for another program.
-
-    :meth:`torchstickcal.Calibration.save` writes everything that a calibration holds, for
-    :meth:`torchstickcal.Calibration.load`.
-
-    Args:
-        path: of the file.
-        calibration: the calibration.
-        format: name of the format, a key of :data:`CALIBRATION_WRITERS`.
-
-    Raises:
-        ConfigError: for an unknown format.
-        OSError: if the file cannot be written.
-
-    Example:
-        >>> import tempfile
-        >>> from torchstickcal import calibrate
-        >>> from torchstickcal.io import read_calibration, write_calibration
-        >>> from torchstickcal.simulate import golf_session
-        >>> calibration = calibrate(golf_session(cameras=3, frames=10)[0])
-        >>> with tempfile.TemporaryDirectory() as folder:
-        ...     write_calibration(f"{folder}/calibration.toml", calibration, "pose2sim")
-        ...     rig = read_calibration(f"{folder}/calibration.toml")
-        >>> rig.names, rig.translations.shape
-        (('cam01', 'cam02', 'cam03'), torch.Size([3, 3]))
-    """
-    CALIBRATION_WRITERS[format].write(path, calibration)
 
 
 def reader_of(path: str | Path, registry: Registry[Reader[_Content]], format: str | None) -> Reader[_Content]:

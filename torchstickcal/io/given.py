@@ -40,7 +40,7 @@ class Given:
 
     Args:
         stick: one stick or several; the ends are names or indices of points. ``RKnee`` and ``knee_right`` also mean the point
-            ``right_knee``.
+            ``right_knee``. An empty list where none is needed, as for :func:`torchstickcal.triangulate`.
         intrinsics: a calibration, or a file of one, of which the intrinsics are used. Cameras are matched by name, else by the
             last number in the names, else by order.
         image_size: width and height of the images in which the keypoints were detected, (2,) or (C, 2), pixels.
@@ -51,6 +51,7 @@ class Given:
             to the stick), "auto" ("stick" where the stick's ends come from files of their own, else "largest"), or the number
             that the tracker gave.
         stick_points: keypoints of the stick's ends, where they are in other files than the body's: the path of a recording.
+        turned: how images were turned after the calibration: "left", "right" (a quarter, as a viewer sees it) or "back".
 
     Example:
         >>> Given(Stick("knob", "barrel", 0.864), intrinsics="Calib.toml", fps=120).person
@@ -64,6 +65,7 @@ class Given:
     skeleton: str | None = None
     person: str | int = AUTOMATIC
     stick_points: Recording | None = None
+    turned: str | None = None
 
 
 def complete(recording: Recording, given: Given) -> tuple[Observations, tuple[str, ...]]:
@@ -133,6 +135,10 @@ def amended(observations: Observations, given: Given) -> tuple[Observations, tup
                 got=str(value),
                 expected="keypoints of a detector",
             )
+    if given.turned is not None and given.intrinsics is None:
+        raise CalibrationError(
+            "nothing to turn", where="turned", got=given.turned, expected="the calibration that was made before (--intrinsics)"
+        )
     changes: dict[str, Any] = {}
     notes: tuple[str, ...] = ()
     if given.skeleton is not None:
@@ -144,11 +150,11 @@ def amended(observations: Observations, given: Given) -> tuple[Observations, tup
     if given.intrinsics is not None:
         size = observations.image_size if given.image_size is None else tensor_of(given.image_size, "image_size")
         lenses, notes = lenses_of(
-            _rig(given.intrinsics), observations.camera_labels, _per_camera(size, observations.num_cameras)
+            _rig(given.intrinsics), observations.camera_labels, _per_camera(size, observations.num_cameras), given.turned
         )
         changes |= {name: getattr(lenses, name) for name in ("intrinsics", "distortion", "fisheye", "image_size")}
         changes["intrinsics_known"] = True
-    if given.stick is not None:
+    if given.stick:
         changes["sticks"] = _sticks(given.stick, changes.get("point_names", observations.point_names) or ())
     return (replace(observations, **changes) if changes else observations), notes
 
@@ -229,7 +235,7 @@ def _lenses(recording: Recording, given: Given) -> tuple[Lenses, list[str]]:
     size = told if given.image_size is None else _sizes(given.image_size, labels, told)
     source = recording.intrinsics if given.intrinsics is None else given.intrinsics
     if source is not None:
-        lenses, notes = lenses_of(_rig(source), labels, size)
+        lenses, notes = lenses_of(_rig(source), labels, size, given.turned)
         return lenses, [*([f"The intrinsics are those of {source}."] if given.intrinsics is None else []), *notes]
     if not bool(size.isfinite().all()):
         raise CalibrationError(

@@ -8,9 +8,13 @@ from typing import Any
 
 import numpy as np
 
+from torchstickcal.errors import CalibrationError
+from torchstickcal.files import atomic_path, json_text
+from torchstickcal.io.about import about
 from torchstickcal.io.colmap import camera_of_image
-from torchstickcal.io.formats import calibration_reader, reading
+from torchstickcal.io.formats import calibration_reader, camera_writer, reading
 from torchstickcal.io.rig import Rig, RigCamera
+from torchstickcal.io.writers import file_names
 from torchstickcal.untrusted import read_json
 
 _DESCRIPTION = "cameras of nerfstudio (transforms.json)"
@@ -31,6 +35,34 @@ def read_nerfstudio(path: str | Path) -> Rig:
         content = read_json(path)
         shared = {key: value for key, value in content.items() if key != "frames"}
         return Rig.of([_camera(shared | frame) for frame in content["frames"]], None)
+
+
+@camera_writer("nerfstudio", "cameras of nerfstudio, in metres", file_name="transforms.json")
+def write_nerfstudio(path: Path, rig: Rig) -> None:
+    """Write a frame for each camera, whose image is ``images/NAME.png``. All lenses must be of one model."""
+    rig.check_plain("nerfstudio")
+    if len(set(rig.fisheye)) > 1:
+        raise CalibrationError(
+            "lenses of both models in one file",
+            where="nerfstudio",
+            got="fisheye and other lenses",
+            expected="lenses of one model",
+        )
+    rotations, translations = rig.in_metres().poses()
+    frames = []
+    for camera, name in enumerate(file_names(rig.names)):
+        pose = np.eye(4)
+        pose[:3, :3] = rotations[camera].mT.numpy() @ _TURN
+        pose[:3, 3] = -(rotations[camera].mT @ translations[camera]).numpy()
+        (fx, _, cx), (_, fy, cy), _ = rig.intrinsics[camera].tolist()
+        width, height = map(round, rig.size(camera))
+        lens = zip(_LENS[rig.fisheye[camera]], rig.coefficients(camera, 5, 5, "nerfstudio"), strict=True)
+        frame = {"file_path": f"images/{name}.png", "fl_x": fx, "fl_y": fy, "cx": cx + 0.5, "cy": cy + 0.5}
+        frames.append(frame | {"w": width, "h": height} | dict(lens) | {"transform_matrix": pose.tolist()})
+    model = "OPENCV_FISHEYE" if rig.fisheye[0] else "OPENCV"
+    said = about("metres", rig.world, "Poses are from cameras to the world, with y up and z backwards in a camera.")
+    with atomic_path(path) as temporary:
+        temporary.write_text(json_text({"camera_model": model, "about": said, "frames": frames}) + "\n", "utf-8")
 
 
 def _camera(frame: Mapping[str, Any]) -> RigCamera:

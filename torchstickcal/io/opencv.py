@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -10,9 +11,12 @@ from xml.etree.ElementTree import Element
 import numpy as np
 from numpy.typing import NDArray
 
-from torchstickcal.io.formats import calibration_reader, head_of, reading
+from torchstickcal.files import atomic_set
+from torchstickcal.io.about import about, comments
+from torchstickcal.io.formats import calibration_reader, camera_writer, head_of, reading
 from torchstickcal.io.recording import in_folder
 from torchstickcal.io.rig import Rig, RigCamera
+from torchstickcal.io.writers import file_names
 from torchstickcal.untrusted import read_json, read_xml, read_yaml
 
 _DESCRIPTION = "a camera of OpenCV (.yml, .xml or .json of FileStorage), or a folder with several"
@@ -63,6 +67,51 @@ def read_opencv(path: str | Path) -> Rig:
             with reading(file, _DESCRIPTION):
                 cameras.append(_camera(file))
         return Rig.of(cameras, None)
+
+
+@camera_writer(
+    "opencv",
+    "a file of OpenCV's FileStorage for each camera, in metres (.yml)",
+    file_name="opencv",
+    files=("*.yml",),
+)
+def write_opencv(path: Path, rig: Rig) -> None:
+    """Write a file for each camera into a folder, called as the camera. A fisheye lens has ``distortion_model: fisheye``."""
+    with atomic_set(path) as folder:
+        for camera, (name, file) in enumerate(zip(rig.names, file_names(rig.names), strict=True)):
+            width, height = map(round, rig.size(camera))
+            text = storage_head(rig, "x_camera = R x_world + T.") + f"camera_name: {json.dumps(name)}\n"
+            text += f"image_width: {width}\nimage_height: {height}\n"
+            text += f"distortion_model: {'fisheye' if rig.fisheye[camera] else 'plumb_bob'}\n"
+            text += storage_matrix("camera_matrix", rig.intrinsics[camera].numpy())
+            text += storage_matrix("distortion_coefficients", [rig.coefficients(camera, 5, 14, "OpenCV")])
+            if rig.rotations is not None:
+                rotations, translations = rig.poses()
+                text += storage_matrix("R", rotations[camera].numpy())
+                text += storage_matrix("T", translations[camera][:, None].numpy())
+            (folder / f"{file}.yml").write_text(text, "utf-8")
+
+
+def storage_head(rig: Rig, more: str = "") -> str:
+    """The first lines of a file of FileStorage, with comments about its content."""
+    return "%YAML:1.0\n---\n" + comments(about("metres", rig.world, more))
+
+
+def storage_matrix(name: str, matrix: Any) -> str:
+    """A matrix as FileStorage writes it.
+
+    Example:
+        >>> print(storage_matrix("T", [[0.5], [2]]), end="")
+        T: !!opencv-matrix
+           rows: 2
+           cols: 1
+           dt: d
+           data: [ 0.5, 2.0 ]
+    """
+    values = np.asarray(matrix, dtype=np.float64)
+    rows, columns = values.shape
+    data = ", ".join(map(repr, values.ravel().tolist()))
+    return f"{name}: !!opencv-matrix\n   rows: {rows}\n   cols: {columns}\n   dt: d\n   data: [ {data} ]\n"
 
 
 def matrix_of(value: Any) -> NDArray[np.float64]:

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Any
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
 
 import cv2
 import numpy as np
@@ -13,6 +13,10 @@ from torch import Tensor
 
 from torchstickcal.errors import CalibrationError
 from torchstickcal.shapes import check_shapes
+from torchstickcal.world import World
+
+if TYPE_CHECKING:
+    from torchstickcal.result import Calibration
 
 _ROTATION_TOLERANCE = 1e-3
 """Largest entry of ``R R^T - 1`` of a rotation: files may give rotations with three or four digits."""
@@ -65,6 +69,76 @@ class Rig:
     """(C, 3), world to camera, in metres unless ``unit`` is None"""
     unit: str | None = "m"
     """unit of length in the file; None if neither the file nor its format says which it is"""
+    world: World | None = None
+    """the frame of the poses; None where a file does not say it"""
+    error_px: float | None = None
+    """median reprojection error, mean over the cameras; None where it is not known"""
+
+    @classmethod
+    def of_calibration(cls, calibration: Calibration) -> Rig:
+        """The cameras of a calibration that was estimated."""
+        distortion, size = calibration.distortion, calibration.image_size
+        none = torch.zeros(0, dtype=torch.float64)
+        count = len(calibration.camera_names)
+        lenses = tuple(none if distortion is None else distortion[index].double().cpu() for index in range(count))
+        return cls(
+            names=calibration.camera_names,
+            intrinsics=calibration.intrinsics.cpu(),
+            distortion=lenses,
+            fisheye=(calibration.fisheye,) * count,
+            image_size=None if size is None else size.cpu(),
+            rotations=calibration.rotations.cpu(),
+            translations=calibration.translations.cpu(),
+            world=calibration.world,
+            error_px=float(calibration.reprojection_median_px.mean()),
+        )
+
+    def in_metres(self, unit: str | None = None) -> Rig:
+        """The same in metres; arguments and errors as of :meth:`poses`. Without poses there is nothing to do."""
+        if self.rotations is None:
+            return self
+        rotations, translations = self.poses(unit)
+        return replace(self, rotations=rotations, translations=translations, unit="m")
+
+    def coefficients(self, camera: int, least: int, most: int, what: str) -> list[float]:
+        """The distortion coefficients of a camera for a format that holds some number of them.
+
+        Args:
+            camera: its index.
+            least: how many there must be; zeros are appended.
+            most: how many there may be, 4 for a fisheye lens.
+            what: the format, for the message.
+
+        Raises:
+            CalibrationError: if it has more.
+        """
+        values = self.distortion[camera].tolist()
+        most = min(most, 4) if self.fisheye[camera] else most
+        if any(values[most:]):
+            raise CalibrationError(
+                "a lens that the format cannot hold",
+                where=f"{what}, {self.names[camera]}",
+                got=f"{len(values)} distortion coefficients",
+                expected=f"at most {most}",
+            )
+        values = values[:most]
+        return values + [0.0] * (min(least, most) - len(values))
+
+    def size(self, camera: int) -> list[float]:
+        """Width and height of a camera's images, pixels; where they are not known, twice the principal point."""
+        if self.image_size is not None and bool(self.image_size[camera].isfinite().all()):
+            return self.image_size[camera].tolist()
+        return (2 * self.intrinsics[camera, :2, 2]).tolist()
+
+    def check_plain(self, what: str, fisheye: bool = True) -> None:
+        """Raise a CalibrationError if the cameras are skewed, or have fisheye lenses that a format (``what``) cannot hold."""
+        for name, matrix, is_fisheye in zip(self.names, self.intrinsics, self.fisheye, strict=True):
+            got = f"a skew of {float(matrix[0, 1]):g} pixels" if matrix[0, 1] else "a fisheye lens"
+            if bool(matrix[0, 1]) or (is_fisheye and not fisheye):
+                expected = "pixels at right angles" if matrix[0, 1] else "OpenCV's usual lens model"
+                raise CalibrationError(
+                    "a camera that the format cannot hold", where=f"{what}, {name}", got=got, expected=expected
+                )
 
     @classmethod
     def of(cls, cameras: Sequence[RigCamera], unit: str | None = "m") -> Rig:

@@ -12,14 +12,8 @@ from torchstickcal.io import safe_pickle
 from torchstickcal.io.formats import reading, session_of, session_reader
 from torchstickcal.io.truth import Truth
 from torchstickcal.observations import Observations
+from torchstickcal.skeletons import SPORTS_STICK_SYN_JOINTS
 from torchstickcal.stick import Stick
-
-SPORTS_STICK_SYN_JOINTS = (
-    "pelvis", "spine", "right_shoulder", "left_shoulder", "neck", "head", "head_top",
-    "right_elbow", "right_wrist", "right_hand", "left_elbow", "left_wrist", "left_hand",
-    "right_knee", "right_shin", "right_ankle", "left_knee", "left_shin", "left_ankle",
-)  # fmt: skip
-"""The 19 joints of Sports-Stick-Syn. The files do not name them; the names are chosen by the bones' lengths and positions."""
 
 _DESCRIPTION = "sequence of the data set Sports-Stick-Syn (a pickle; none of its code is run)"
 

@@ -11,7 +11,7 @@ import torch
 from torch import nn
 
 from torchstickcal.arrays import names_of, tensor_of
-from torchstickcal.config import Config, load_config
+from torchstickcal.config import Config, load_config, with_noise
 from torchstickcal.errors import CalibrationError, ConfigError, ObservationError, RigError, quoted
 from torchstickcal.layer.inputs import LayerInputs, is_of_session
 from torchstickcal.layer.result import LayerResult
@@ -37,9 +37,10 @@ class CalibrationLayer(nn.Module):
     Where the configuration estimates lenses, those given are the start. Where it estimates clocks, frames of equal number are
     taken to be of about the same time: time offsets of up to about a frame are found, whole frames are not searched for.
 
-    Some things count as constants in the gradients: the noise of the keypoints, the choice of outliers and the labels (which
-    keypoint each point uses), where the configuration estimates them; and, with clocks, how far each keypoint is moved to the
-    common time, its velocity in the image, and its loss of weight by interpolation.
+    The gradients are those of all that is estimated, also of the noise: of the keypoints, how long their errors last, and how
+    much points accelerate. Decisions count as constants: which keypoints are outliers, which keypoint each point uses, and
+    whether errors last at all; and, with clocks, how far each keypoint is moved to the common time, its velocity in the image,
+    and its loss of weight by interpolation.
 
     Args:
         sticks: the stick or sticks, as of :class:`Observations`.
@@ -48,6 +49,8 @@ class CalibrationLayer(nn.Module):
         point_names: names of the points, for sticks and losses that name them.
         on_failure: what happens if a session cannot be calibrated: ``status`` (its status says why, and its gradients are zero)
             or ``raise`` (an error for the whole batch).
+        noise: as of :func:`torchstickcal.calibrate`. Choose ``given`` to train confidences: a factor on all confidences of one
+            point then has an effect, and a gradient.
 
     Raises:
         ConfigError: if the configuration cannot be used, or leaves it to the data what is refined, or for another
@@ -71,11 +74,12 @@ class CalibrationLayer(nn.Module):
         gradient: str | GradientMode = "implicit",
         point_names: Sequence[str] | None = None,
         on_failure: Literal["status", "raise"] = "status",
+        noise: Literal["estimated", "given"] | None = None,
     ) -> None:
         super().__init__()
         self.point_names = names_of(point_names, "point_names")
         self.sticks = located_sticks(sticks, self.point_names)
-        self.config = load_config(config)
+        self.config = load_config(config) if noise is None else with_noise(load_config(config), noise)
         self._refined = _refined(self.config)
         self.gradient = gradient_mode(gradient)
         if on_failure not in ("status", "raise"):
@@ -158,7 +162,7 @@ class CalibrationLayer(nn.Module):
 
     def _calibrated(self, given: LayerInputs, initial: LayerResult | None) -> LayerResult:
         """All sessions; those that can be begun are solved side by side, a few at a time."""
-        device, run = given.keypoints.device, Run(self.config)
+        device, run = given.keypoints.device, Run(self.config, to_rounding=True)
         if initial is not None:
             self._check_initial(initial, given)
 

@@ -36,14 +36,31 @@ _VALUES_AT_ONCE = 2**22
 
 
 @dataclass(frozen=True)
+class CorrelationGates:
+    """What was decided when errors were found to last: held where the estimate is repeated or differentiated."""
+
+    significant: Tensor
+    """(B, bins), the bins of lags whose correlation chance does not explain"""
+    nothing: Tensor
+    """(B, P), points whose errors do not last where those of others do"""
+
+    def replaced(self, where: Tensor, other: CorrelationGates) -> CorrelationGates:
+        """The decisions with some sessions (B,), True where, taken from another."""
+        significant, nothing = ((self.significant, other.significant), (self.nothing, other.nothing))
+        return CorrelationGates(*(torch.where(where[:, None], new, old) for old, new in (significant, nothing)))
+
+
+@dataclass(frozen=True)
 class ErrorCorrelation:
     """Autocorrelation of the keypoint errors along each point's track, by lag.
 
     Args:
         values: (B, P, F), the correlation of errors that are 0, 1, ... F - 1 frames apart, 0 to 1; 1 at lag 0.
+        gates: what was decided; None for sessions of one or two frames.
     """
 
     values: Tensor
+    gates: CorrelationGates | None = None
 
     @property
     def lasts(self) -> bool:
@@ -76,7 +93,9 @@ class ErrorCorrelation:
         return self.values[..., lags] @ pairs / pairs.sum()
 
 
-def error_correlation(measurements: Measurements, state: State, sigma_px: Tensor, contrast: float = 0.0) -> ErrorCorrelation:
+def error_correlation(
+    measurements: Measurements, state: State, sigma_px: Tensor, contrast: float = 0.0, gates: CorrelationGates | None = None
+) -> ErrorCorrelation:
     """The autocorrelation of the keypoint errors, from the residuals.
 
     The estimates of different points are shrunk towards their common mean (empirical Bayes), as those of the noise are.
@@ -87,21 +106,33 @@ def error_correlation(measurements: Measurements, state: State, sigma_px: Tensor
         sigma_px: noise of each point's keypoints, (B, P), pixels.
         contrast: variance of the logarithm of what lasts between points that is taken for granted; with more, points are drawn
             less towards the mean.
+        gates: what was decided before, to be held; None to decide. With them, the estimate is in float64 and differentiable.
     """
     m = measurements
     values = torch.zeros(m.sessions, m.points_per_frame, m.frames, dtype=torch.float64, device=m.pixels.device)
     values[..., 0] = 1.0
-    if m.frames > 2:
-        bins = _bins(m.frames, values.device)
-        products, pairs = _binned_products(m, _residual_tracks(m, state, sigma_px), bins)
-        free = _freedom_share(m)
-        products, pairs = free[..., None] * products, free[..., None] * pairs
-        common, time = _pooled(products.sum(1), pairs.sum(1), bins.bincount())
-        if bool(common.any()):
-            independent = 2 * free * m.by_frame(m.visible.sum(1)).sum(1) / time.clamp_max(m.frames)
-            amplitudes = _amplitudes(products, pairs, common, independent, contrast)
-            values[..., 1:] = (amplitudes[..., None] * common[:, None]).clamp(0.0, 1.0)[..., bins]
-    return ErrorCorrelation(values)
+    if m.frames <= 2:
+        return ErrorCorrelation(values)
+    bins = _bins(m.frames, values.device)
+    if gates is not None and not bool(gates.significant.any()):
+        return ErrorCorrelation(values, gates)
+    precision = torch.float32 if gates is None else torch.float64
+    products, pairs = _binned_products(m, _residual_tracks(m, state, sigma_px, precision), bins)
+    free = _freedom_share(m)
+    products, pairs = free[..., None] * products, free[..., None] * pairs
+    held = None if gates is None else gates.significant
+    common, time, significant = _pooled(products.sum(1), pairs.sum(1), bins.bincount(), held)
+    if gates is None:
+        gates = CorrelationGates(significant, torch.zeros_like(values[..., 0], dtype=torch.bool))
+        if not bool(significant.any()):
+            return ErrorCorrelation(values, gates)
+        nothing = None
+    else:
+        nothing = gates.nothing
+    independent = 2 * free * m.by_frame(m.visible.sum(1)).sum(1) / time.clamp_max(m.frames)
+    amplitudes, nothing = _amplitudes(products, pairs, common, independent, contrast, nothing)
+    values[..., 1:] = (amplitudes[..., None] * common[:, None]).clamp(0.0, 1.0)[..., bins]
+    return ErrorCorrelation(values, CorrelationGates(significant, nothing))
 
 
 def _bins(frames: int, device: torch.device) -> Tensor:
@@ -112,16 +143,21 @@ def _bins(frames: int, device: torch.device) -> Tensor:
     return torch.tensor(bins[: frames - 1], device=device)
 
 
-def _residual_tracks(m: Measurements, state: State, sigma_px: Tensor) -> Tensor:
-    """Whitened residuals by track, (B, P, C, 2, F), in float32; zero where not seen."""
-    tracks = sigma_px.new_empty(m.sessions, m.points_per_frame, m.num_cameras, 2, m.frames, dtype=torch.float32)
+def _residual_tracks(m: Measurements, state: State, sigma_px: Tensor, precision: torch.dtype) -> Tensor:
+    """Whitened residuals by track, (B, P, C, 2, F); zero where not seen."""
+    tracks = sigma_px.new_empty(m.sessions, m.points_per_frame, m.num_cameras, 2, m.frames, dtype=precision)
     for columns, residuals, _ in m.residuals(state):
-        weights = m.confidence[..., columns].sqrt().unflatten(-1, (-1, m.points_per_frame)) / sigma_px[:, None, None]
+        weights = _square_roots(m.confidence[..., columns]).unflatten(-1, (-1, m.points_per_frame)) / sigma_px[:, None, None]
         whitened = residuals.unflatten(-1, (-1, m.points_per_frame)) * weights.unsqueeze(2)
         whitened = whitened.where(weights.unsqueeze(2) > 0, 0.0).clamp(-_CUT, _CUT)
         frames = slice(columns.start // m.points_per_frame, columns.stop // m.points_per_frame)
-        tracks[..., frames] = whitened.movedim(-1, 1).to(torch.float32)
+        tracks[..., frames] = whitened.movedim(-1, 1).to(precision)
     return tracks
+
+
+def _square_roots(confidence: Tensor) -> Tensor:
+    """Their square roots; the derivative where they are zero is zero."""
+    return confidence.where(confidence > 0, 1.0).sqrt().where(confidence > 0, 0.0)
 
 
 def _binned_products(m: Measurements, tracks: Tensor, bins: Tensor) -> tuple[Tensor, Tensor]:
@@ -152,8 +188,9 @@ def _freedom_share(m: Measurements) -> Tensor:
     return free / m.by_frame(2 * views).sum(1).clamp_min(1)
 
 
-def _pooled(products: Tensor, pairs: Tensor, widths: Tensor) -> tuple[Tensor, Tensor]:
-    """The correlation of all points together by bin that chance does not explain, (B, bins), and its integrated time (B, 1).
+def _pooled(products: Tensor, pairs: Tensor, widths: Tensor, held: Tensor | None) -> tuple[Tensor, Tensor, Tensor]:
+    """The correlation of all points together by bin that chance does not explain, (B, bins), and its integrated time (B, 1);
+    also in which bins there is such a correlation, (B, bins).
 
     The sampling variance of a bin is one over its pairs where errors are independent. Where they last, the products at
     neighbouring lags are alike too (Bartlett's formula), by what was found at smaller lags.
@@ -162,23 +199,28 @@ def _pooled(products: Tensor, pairs: Tensor, widths: Tensor) -> tuple[Tensor, Te
         products: sums of the products of residuals, (B, bins).
         pairs: their numbers, as far as they are independent, (B, bins).
         widths: (bins,), numbers of lags.
+        held: (B, bins), in which bins there is such a correlation; None to decide.
     """
-    values = torch.zeros_like(products)
+    values: list[Tensor] = []
+    decided: list[Tensor] = []
     time, squares = (torch.ones_like(products[:, :1]) for _ in range(2))
     for number, width in enumerate(widths.tolist()):
         one = slice(number, number + 1)
         variance = torch.minimum(time.square(), width * squares) / pairs[:, one].clamp_min(0.1)
         found = products[:, one] / pairs[:, one].clamp_min(0.1)
-        found = found.where(found > _SIGNIFICANT * variance.sqrt(), 0.0).clamp(0.0, 1.0)
-        if number:
-            found = found.where(pairs[:, one] >= _LEAST_PAIRS, values[:, number - 1 : number])
-        values[:, one] = found
-        time, squares = time + 2 * width * found, squares + 2 * width * found.square()
-    return values, time
+        above = found > _SIGNIFICANT * variance.sqrt() if held is None else held[:, one]
+        enough = pairs[:, one] >= _LEAST_PAIRS if number else torch.ones_like(above)
+        found = found.where(above, 0.0).clamp(0.0, 1.0)
+        values.append(found if not number else found.where(enough, values[-1]))
+        decided.append(above & enough)
+        time, squares = time + 2 * width * values[-1], squares + 2 * width * values[-1].square()
+    return torch.cat(values, dim=1), time, torch.cat(decided, dim=1)
 
 
-def _amplitudes(products: Tensor, pairs: Tensor, common: Tensor, independent: Tensor, contrast: float) -> Tensor:
-    """How much of the common correlation (B, bins) each point has, (B, P), drawn towards that of all points.
+def _amplitudes(
+    products: Tensor, pairs: Tensor, common: Tensor, independent: Tensor, contrast: float, nothing: Tensor | None
+) -> tuple[Tensor, Tensor]:
+    """How much of the common correlation (B, bins) each point has, (B, P), drawn towards that of all points; and who has none.
 
     It is a variance, that of the errors that last, estimated from few independent ones. So its logarithm is drawn towards the
     mean, as that of the noise is. A point that has none where others clearly have some gets
@@ -190,13 +232,15 @@ def _amplitudes(products: Tensor, pairs: Tensor, common: Tensor, independent: Te
         common: the correlation of all points together.
         independent: (B, P), number of independent errors that each point has had.
         contrast: variance of the logarithms between points that is taken for granted.
+        nothing: (B, P), the points that have none; None to decide.
     """
     by_chance = (pairs @ common.square()[..., None])[..., 0].clamp_min(1e-12).reciprocal()
     own = (products @ common[..., None])[..., 0] * by_chance
     least = _SIGNIFICANT_OF_POINT * by_chance.sqrt()
     scatter = 2 / independent.clamp_min(0.1)
-    nothing = (own < least) & (least < (-_SIGNIFICANT_OF_POINT * scatter.sqrt()).exp())
+    if nothing is None:
+        nothing = (own < least) & (least < (-_SIGNIFICANT_OF_POINT * scatter.sqrt()).exp())
     own = torch.maximum(own, least).clamp_max(_LARGEST_AMPLITUDE)
     sampling = by_chance / own.square() + scatter
     drawn = shrunk_logarithms(own.log(), sampling, independent > 0, contrast, _FARTHEST).exp()
-    return drawn.where(~nothing, _MEAN_BY_CHANCE * by_chance.sqrt())
+    return drawn.where(~nothing, _MEAN_BY_CHANCE * by_chance.sqrt()), nothing

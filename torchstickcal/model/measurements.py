@@ -125,6 +125,20 @@ class Measurements:
             motion=self.motion and ImageMotion(*(tensor[sessions] for tensor in self.motion)),
         )
 
+    def detached(self) -> Measurements:
+        """The same measurements without gradients."""
+        lens = self.cameras.distortion
+        return replace(
+            self,
+            pixels=self.pixels.detach(),
+            confidence=self.confidence.detach(),
+            cameras=replace(
+                self.cameras, matrix=self.cameras.matrix.detach(), distortion=None if lens is None else lens.detach()
+            ),
+            lengths_m=self.lengths_m.detach(),
+            unknowns=replace(self.unknowns, prior_sigma=self.unknowns.prior_sigma.detach()),
+        )
+
     def within(self, window: slice) -> Measurements:
         """The measurements of some frames."""
         columns = self.columns_of(window)
@@ -145,6 +159,11 @@ class Measurements:
         """The measurements without the keypoints outside a mask (B, C, N), and without points left with a single view."""
         confidence = self.confidence * kept
         return replace(self, confidence=confidence.mul_((confidence > 0).sum(-2, keepdim=True) >= 2))
+
+    def without_sticks(self) -> Measurements:
+        """The same keypoints, of which no distance is known."""
+        none = {"sticks": self.sticks[:0], "lengths_m": self.lengths_m[:, :0], "stick_sigma_m": self.stick_sigma_m[:0]}
+        return replace(self, **none)
 
     def squared_residuals(self, state: State) -> Tensor:
         """Squared distances (B, C, N) between projections and keypoints, square pixels, times the keypoint's confidence.

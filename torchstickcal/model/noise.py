@@ -10,7 +10,7 @@ from torchstickcal.losses.track import combined, consecutive
 from torchstickcal.model.measurements import Measurements
 from torchstickcal.model.shrinkage import shrunk_logarithms
 
-_CUT = 3.5
+NEAR_SIGMAS = 3.5
 """Residual, in standard deviations, beyond which a keypoint takes no part in the estimate of the noise. With a wide cut,
 outliers raise the estimate, it lets more of them in, and stays at several times the noise."""
 _ITERATIONS = 4
@@ -26,32 +26,53 @@ _MIN_VARIANCE_RATIO = 0.01
 
 
 def estimate_sigma_px(measurements: Measurements, squared_residuals: Tensor) -> Tensor:
-    """Standard deviation of the keypoints along an image axis, for each point, (B, P), pixels.
+    """Standard deviation of the keypoints along an image axis, for each point, (B, P), pixels: of :func:`sigma_px_of`."""
+    return sigma_px_of(measurements, squared_residuals, near_keypoints(measurements, squared_residuals))
 
-    It is the root mean square of the residuals below 2.5 standard deviations, corrected for this cut and for the three degrees
-    of freedom of each 3D point. The estimates of different points are then shrunk towards their common mean (empirical Bayes on
-    the log variances). If their differences can be explained by chance, all points get the same value. Of a long session, 2000
-    evenly spaced frames are used.
+
+def near_keypoints(measurements: Measurements, squared_residuals: Tensor) -> Tensor:
+    """The keypoints that take part in the estimate of the noise: those with residuals below 3.5 standard deviations.
+
+    Of a long session, 2000 evenly spaced frames are looked at.
 
     Args:
         measurements: the sessions.
         squared_residuals: from :meth:`Measurements.squared_residuals`, (B, C, N).
+
+    Returns:
+        A mask (B, C, N), False in frames that are not looked at.
     """
-    frames = torch.linspace(0, measurements.frames - 1, min(measurements.frames, _MAX_FRAMES)).round().long()
-    visible = measurements.by_frame(measurements.visible)[:, :, frames]
-    squared = measurements.by_frame(squared_residuals)[:, :, frames].double()
+    squared = _of_some_frames(measurements, squared_residuals)
+    visible = _of_some_frames(measurements, measurements.visible)
     variance, views = _initial_variance(squared, visible), visible.sum(1)
-    moments = _truncated_moments(measurements.num_cameras).to(squared)
-    for _ in range(_ITERATIONS):
-        inliers = visible & (squared <= (_CUT**2 * variance[:, None] * _remaining_share(views))[:, None])
-        inliers = inliers & (inliers.sum(1, keepdim=True) >= 2)
-        views = inliers.sum(1)
-        by_point = (2 * views - 3).clamp_min(0)
-        degrees_of_freedom = by_point.sum(1).to(squared)
-        expected = (by_point * moments[views]).sum(1).clamp_min(moments[2])
-        variance = squared.where(inliers, 0.0).sum((1, 2)) / expected
-        variance = _shrink(variance.clamp_min(_MIN_SIGMA_PX**2), degrees_of_freedom)
-    return variance.sqrt()
+    near = visible
+    for iteration in range(_ITERATIONS):
+        if iteration:
+            variance = _variance(squared, near, measurements.num_cameras, NEAR_SIGMAS)
+        near = visible & (squared <= (NEAR_SIGMAS**2 * variance[:, None] * _remaining_share(views))[:, None])
+        near = near & (near.sum(1, keepdim=True) >= 2)
+        views = near.sum(1)
+    mask = torch.zeros_like(measurements.by_frame(measurements.visible))
+    mask[:, :, _frames_looked_at(measurements)] = near
+    return mask.flatten(2)
+
+
+def sigma_px_of(measurements: Measurements, squared_residuals: Tensor, taking_part: Tensor, cut: float = NEAR_SIGMAS) -> Tensor:
+    """Standard deviation of the keypoints along an image axis, for each point, (B, P), pixels. Differentiable.
+
+    It is that of a keypoint of confidence 1: the root mean square of the residuals of the keypoints that take part, corrected
+    for the cut and for the three degrees of freedom of each 3D point. The estimates of different points are then shrunk towards
+    their common mean (empirical Bayes on the log variances). If their differences can be explained by chance, all points get
+    the same value.
+
+    Args:
+        measurements: the sessions.
+        squared_residuals: from :meth:`Measurements.squared_residuals`, (B, C, N).
+        taking_part: the keypoints that take part, (B, C, N), as from :func:`near_keypoints`.
+        cut: residual, in standard deviations, up to which they do.
+    """
+    squared = _of_some_frames(measurements, squared_residuals)
+    return _variance(squared, _of_some_frames(measurements, taking_part), measurements.num_cameras, cut).sqrt()
 
 
 def estimate_acceleration_m(measurements: Measurements, points: Tensor, point_variance: Tensor) -> Tensor:
@@ -76,6 +97,27 @@ def estimate_acceleration_m(measurements: Measurements, points: Tensor, point_va
     return torch.maximum(variance, detectable).clamp_min(_MIN_ACCELERATION_M**2).sqrt()
 
 
+def _frames_looked_at(measurements: Measurements) -> Tensor:
+    return torch.linspace(0, measurements.frames - 1, min(measurements.frames, _MAX_FRAMES)).round().long()
+
+
+def _of_some_frames(measurements: Measurements, columns: Tensor) -> Tensor:
+    """A tensor (B, C, N) by frame, (B, C, F', P), of the frames that are looked at; numbers in float64."""
+    by_frame = measurements.by_frame(columns)
+    if measurements.frames > _MAX_FRAMES:
+        by_frame = by_frame[:, :, _frames_looked_at(measurements)]
+    return by_frame.double() if by_frame.is_floating_point() else by_frame
+
+
+def _variance(squared: Tensor, near: Tensor, cameras: int, cut: float) -> Tensor:
+    """Variance of the keypoints (B, P), from squared residuals below a cut: of those that take part, both (B, C, F', P)."""
+    by_point = (2 * near.sum(1) - 3).clamp_min(0)
+    moments = _truncated_moments(cameras, cut).to(squared)
+    expected = (by_point * moments[near.sum(1)]).sum(1).clamp_min(moments[2])
+    variance = squared.where(near, 0.0).sum((1, 2)) / expected
+    return _shrink(variance.clamp_min(_MIN_SIGMA_PX**2), by_point.sum(1).to(squared))
+
+
 def _initial_variance(squared: Tensor, visible: Tensor) -> Tensor:
     """Variance (B, P) from the lower quartile of the squared residuals, which the better keypoints determine.
 
@@ -97,10 +139,10 @@ def _remaining_share(views: Tensor) -> Tensor:
     return (2 * views - 3).clamp_min(1) / (2 * views).clamp_min(4)
 
 
-def _truncated_moments(cameras: int) -> Tensor:
+def _truncated_moments(cameras: int, cut: float) -> Tensor:
     """Second moments of residuals below the cut, as fractions of the full moments, by the number of views from 0 to C."""
     half = _degrees(cameras) / 2
-    limit = half * _CUT**2 / 2
+    limit = half * cut**2 / 2
     return torch.special.gammainc(half + 1, limit) / torch.special.gammainc(half, limit)
 
 

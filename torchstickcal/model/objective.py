@@ -15,6 +15,7 @@ from torch import Tensor
 
 from torchstickcal.geometry import se3
 from torchstickcal.geometry.cameras import Intrinsics, PixelMap
+from torchstickcal.geometry.symmetric import IDENTITY, inverse_diagonal
 from torchstickcal.lazy import cached_property
 from torchstickcal.losses import CameraPointLoss, FrameLoss, Loss, TrackLoss
 from torchstickcal.losses.camera_point import CameraPointTerms, UnknownTerms
@@ -102,22 +103,55 @@ class Objective:
             point_step: (B, 3, N).
             unknown_step: (B, K), of what else is unknown of the cameras.
         """
+        by_images = self.slope_of_images(state, camera_step, point_step, unknown_step, slice(0, self.measurements.num_columns))
+        return by_images + self.slope_of_scene(state, point_step, unknown_step)
+
+    def slope_of_images(
+        self, state: State, camera_step: Tensor, point_step: Tensor, unknown_step: Tensor, columns: slice
+    ) -> Tensor:
+        """The part of :meth:`slope` that some columns have through the losses of camera and point."""
         m = self.measurements
-        moved = point_step[:, None] + se3.moved(se3.hat(camera_step[..., 3:]), camera_step[..., :3], state.points)
-        points_cam, moved_cam = state.in_cameras(), state.rotations @ moved
-        at = self._unknowns_at(state)
+        turned = se3.moved(se3.hat(camera_step[..., 3:]), camera_step[..., :3], state.points[..., columns])
+        points_cam, moved_cam = state.in_cameras(columns), state.rotations @ (point_step[:, None, :, columns] + turned)
+        at = self._unknowns_at(state, columns)
         step = m.unknowns.by_camera(unknown_step)
-        total = (state.unknowns * unknown_step / m.unknowns.prior_sigma.square()).sum()
+        total = state.points.new_zeros(())
         for name, loss in self._camera_point.items():
-            information = m.confidence * self._information[name]
-            loss = loss.of_columns(slice(0, m.num_columns), m.points_per_frame)
+            information = m.confidence[..., columns] * self._information[name][..., columns]
+            loss = loss.of_columns(columns, m.points_per_frame)
             total = total + loss.slope(points_cam, moved_cam, at.pixels, information, at.cameras, at.if_any, step)
+        return total
+
+    def slope_of_scene(self, state: State, point_step: Tensor, unknown_step: Tensor) -> Tensor:
+        """The part of :meth:`slope` by the other losses and the prior."""
+        m = self.measurements
+        total = (state.unknowns * unknown_step / m.unknowns.prior_sigma.square()).sum()
         points, point_step, active = m.by_frame(state.points), m.by_frame(point_step), m.by_frame(m.active)
         for loss in self._frame.values():
             total = total + loss.slope(points, point_step, m.sticks, m.lengths_m[:, None], active)
         for loss in self._track.values():
             total = total + loss.slope(points, point_step, active)
         return total
+
+    def point_variance(self, state: State) -> Tensor:
+        """Variance of each point for known cameras and without track losses, mean over the three axes, (B, N), square metres.
+
+        Couplings between points are ignored. It is that of the normal equations, differentiable by measurements and state; zero
+        where a point is not known.
+        """
+        m, at = self.measurements, self._unknowns_at(state)
+        points, rotations = m.by_frame(state.points), state.rotations
+        information = torch.zeros_like(state.points[:, :1]).expand(-1, 6, -1)
+        for name, loss in self._camera_point.items():
+            loss = loss.of_columns(slice(0, m.num_columns), m.points_per_frame)
+            own = m.confidence * self._information[name]
+            information = information + loss.point_information(state.in_cameras(), rotations, at.pixels, own, at.cameras)
+        for loss in self._frame.values():
+            own = loss.point_information(points, m.sticks, m.lengths_m[:, None], m.by_frame(m.active))
+            information = information + own.flatten(-2)
+        known = m.active[:, None]
+        identity = information.new_tensor(IDENTITY)[:, None]
+        return inverse_diagonal(torch.where(known, information, identity)).mean(1).where(m.active, 0.0)
 
     def linearise_chunk(
         self, state: State, columns: Columns, exact: bool = False, by_unknowns: bool = True

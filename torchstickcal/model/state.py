@@ -68,6 +68,15 @@ class State:
             unknowns = unknowns + unknown_step
         return State(rotations, translations, self.points + point_step, unknowns)
 
+    def leaves(self) -> State:
+        """The same state, whose tensors are leaves that require gradients."""
+        return _each(lambda tensor: tensor.detach().requires_grad_(), self)
+
+    def gradient(self, value: Tensor) -> State:
+        """The gradient of a number by the tensors of the state, zero where it does not depend on them."""
+        tensors = [getattr(self, field.name) for field in fields(State)]
+        return State(*torch.autograd.grad(value, tensors, allow_unused=True, materialize_grads=True))
+
     def in_cameras(self, columns: Columns = slice(None), dtype: torch.dtype = torch.float64) -> Tensor:
         """The points in every camera's frame, (B, C, 3, N), computed in float64 and then rounded."""
         return se3.moved(self.rotations, self.translations, self.points[..., columns]).to(dtype)

@@ -7,7 +7,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
 
 import torch
@@ -20,9 +20,11 @@ from torchstickcal.model.unknowns import RigUnknowns, clock_refinements, with_re
 from torchstickcal.observations import Observations
 from torchstickcal.pipeline.focal_search import search_focal
 from torchstickcal.pipeline.initialise import initialise, triangulated
+from torchstickcal.pipeline.noise import check_noise
 from torchstickcal.pipeline.relabel import Labels, mended
 from torchstickcal.pipeline.run import Run
 from torchstickcal.pipeline.scale import check_scale, rulers
+from torchstickcal.pipeline.settle import polished, settled
 from torchstickcal.pipeline.stage import StageResult, agreeing_cameras, run_stage
 from torchstickcal.pipeline.synchronise import (
     CLOCK_STAGE,
@@ -218,6 +220,7 @@ def begin(
     refined: Sequence[str] = (),
     offsets_frames: Tensor | None = None,
     start: WarmStart | None = None,
+    poses: tuple[Tensor, Tensor] | None = None,
 ) -> Adjustment:
     """One session with the first estimate of its rig and points.
 
@@ -227,9 +230,12 @@ def begin(
         refined: what is to be estimated of the cameras beside their poses.
         offsets_frames: (C,), time offsets of the cameras' frames, in frames; None for those given.
         start: an earlier estimate; None to estimate the rig from nothing.
+        poses: rotations (C, 3, 3) and translations (C, 3) to start from, up to scale, with the first camera as the world; None
+            to estimate them from nothing.
 
     Raises:
-        ConfigError: if nothing sets the scale, and if there are camera groups, but not a label for each camera.
+        ConfigError: if nothing sets the scale, if there are camera groups, but not a label for each camera, and if the noise of
+            another number of points is given.
         ObservationError: if no two cameras have a frame in common.
         RigError: if the cameras cannot be placed in one rig.
     """
@@ -237,8 +243,15 @@ def begin(
     config, frames = run.config, on_common_frames(observations, offsets_frames)
     seen = measured(frames, config)
     check_scale(seen, rulers(seen, config))
+    check_noise(config, seen.points_per_frame)
     if start is not None:
         state = _state_of(start, seen, config)
+    elif poses is not None:
+        rotations, translations = poses[0][None].double(), poses[1][None].double()
+        state = State.of(rotations, translations, triangulated(seen, rotations, translations, config.initialise))
+        refined = (
+            refined if observations.intrinsics_known or "focal" in refined else with_refinements(refined, ("focal_shared",))
+        )
     elif observations.intrinsics_known:
         state = initialise(seen, config.initialise, observations.camera_labels)
     else:
@@ -251,7 +264,7 @@ def begin(
     if seen.unknowns.clocked:
         begun = replace(begun, measurements=begun.exposures.unmoved(seen))
     if start is not None and config.relabel:
-        begun = _relabelled(begun, run)
+        begun = relabelled(begun, run)
     if start is not None and seen.unknowns.clocked:
         known = begun.measurements
         if start.inliers is not None:
@@ -291,11 +304,12 @@ def adjust_cameras(adjustment: Adjustment, run: Run, only_last: bool = False) ->
         run: what all steps share.
         only_last: whether the state is near enough to begin with the last of these stages.
     """
-    stages = list(run.camera_stages.items())
+    first, *between = run.camera_stages.items()
     if only_last:
-        return _synchronised(_through(stages[-1:], adjustment, run), run)
-    first = _relabelling(stages[:1], adjustment, run)
-    return _synchronised(_through(stages[1:], first, run), run)
+        return _with_last_camera_stage(adjustment, run)
+    if not between:
+        return _settled(_synchronised(_relabelling([first], adjustment, run), run), run)
+    return _with_last_camera_stage(through(between[:-1], _relabelling([first], adjustment, run), run), run)
 
 
 def adjust_again(adjustment: Adjustment, run: Run, refined: Sequence[str]) -> Adjustment:
@@ -319,14 +333,19 @@ def adjust_again(adjustment: Adjustment, run: Run, refined: Sequence[str]) -> Ad
     again = replace(adjustment, refined=tuple(refined), seen=seen, measurements=measurements, state=state)
     if set(refined) - set(adjustment.refined) <= clock_refinements():
         result = again.last._replace(state=state, minimum=replace(again.last.minimum, unknowns=values))
-        return _synchronised(replace(again, results=(result,)), run)
+        return _settled(_synchronised(replace(again, results=(result,)), run), run)
     begun = replace(again, results=(), records=((),) * seen.sessions)
-    return _synchronised(_through(run.camera_stages.items(), begun, run), run)
+    *before, _ = run.camera_stages.items()
+    return _with_last_camera_stage(through(before, begun, run), run)
 
 
 def adjust_points(adjustment: Adjustment, run: Run) -> Adjustment:
     """The stages in which the cameras are fixed."""
-    return _through(run.point_stages.items(), adjustment, run)
+    for named in run.point_stages.items():
+        before, adjustment = adjustment, through([named], adjustment, run, roughly=run.to_rounding)
+        if run.to_rounding:
+            adjustment = _finished(adjustment, run, named, before.state, polished)
+    return adjustment
 
 
 def measured(frames: CommonFrames, config: Config) -> Measurements:
@@ -345,40 +364,85 @@ def points_used(observations: Observations, config: Config) -> list[int] | None:
     return None
 
 
-def _through(stages: Iterable[tuple[str, Stage]], adjustment: Adjustment, run: Run) -> Adjustment:
+def _with_last_camera_stage(adjustment: Adjustment, run: Run) -> Adjustment:
+    """After the last stage that estimates cameras, with clocks and noise that agree with what it found."""
+    *_, last = run.camera_stages.items()
+    roughly = run.to_rounding and run.settles and not adjustment.asynchronous
+    return _settled(_synchronised(through([last], adjustment, run, roughly), run), run)
+
+
+def _settled(adjustment: Adjustment, run: Run) -> Adjustment:
+    """With the noise as it is found where the last camera stage has ended, if that stage takes it from the data.
+
+    Where no such state is found near, the stage is first run to its end.
+    """
+    if not run.settles:
+        return adjustment
+    *_, last = run.camera_stages.items()
+    return _finished(adjustment, run, last, adjustment.state, settled)
+
+
+def _finished(
+    adjustment: Adjustment,
+    run: Run,
+    named: tuple[str, Stage],
+    begin_at: State,
+    finish: Callable[[str, Measurements, StageResult, Run], tuple[StageResult, Tensor]],
+) -> Adjustment:
+    """With the last stage taken to where a function takes it.
+
+    Args:
+        adjustment: sessions that have come near that.
+        run: what all steps share.
+        named: the last stage.
+        begin_at: where the stage begins again, for sessions in which the function has not found what it looks for.
+        finish: the function; it also says in which sessions it has found it.
+    """
+    name, stage = named
+    result, found = finish(name, adjustment.measurements, adjustment.last, run)
+    earlier = adjustment.results[:-1]
+    finished = replace(adjustment, state=result.state, results=(*earlier, result))
+    if bool(found.all()):
+        return finished
+    ended = run_stage(name, stage, adjustment.measurements, begin_at, run)
+    result, _ = finish(name, adjustment.measurements, ended, run)
+    return replace(adjustment, results=earlier).ended(result).replaced(found, finished)
+
+
+def through(stages: Iterable[tuple[str, Stage]], adjustment: Adjustment, run: Run, roughly: bool = False) -> Adjustment:
     """After some stages. One in which keypoints count as fewer is repeated, until what they count no longer changes.
 
     Errors that last are hidden in the cameras, as long as points with such errors determine them.
     """
     for name, stage in stages:
-        adjustment = adjustment.ended(run_stage(name, stage, adjustment.measurements, adjustment.state, run))
+        adjustment = adjustment.ended(run_stage(name, stage, adjustment.measurements, adjustment.state, run, roughly))
         before, times = torch.ones_like(adjustment.last.correlation_frames), adjustment.last.correlation_frames
         for _ in range(_MOST_ROUNDS - 1):
-            settled = ((times / before).log().abs() < _SETTLED).flatten(1).all(1)
-            if bool(settled.all()):
+            unchanged = ((times / before).log().abs() < _SETTLED).flatten(1).all(1)
+            if bool(unchanged.all()):
                 break
-            again = adjustment.ended(run_stage(name, stage, adjustment.measurements, adjustment.state, run))
-            adjustment = again.replaced(settled, adjustment)
+            again = adjustment.ended(run_stage(name, stage, adjustment.measurements, adjustment.state, run, roughly))
+            adjustment = again.replaced(unchanged, adjustment)
             before, times = times, adjustment.last.correlation_frames
     return adjustment
 
 
 def _relabelling(stages: Sequence[tuple[str, Stage]], begun: Adjustment, run: Run) -> Adjustment:
     """Sessions after their first stages, which are run again where label errors were found, until none are left."""
-    ended = _through(stages, begun, run)
+    ended = through(stages, begun, run)
     for _ in range(_MAX_RELABELLINGS if run.config.relabel else 0):
         before = [ended[session] for session in range(ended.seen.sessions)]
-        after = [_relabelled(session, run) for session in before]
+        after = [relabelled(session, run) for session in before]
         changed = torch.tensor(
             [new is not old for new, old in zip(after, before, strict=True)], device=ended.state.points.device
         )
         if not changed.any():
             break
-        ended = _through(stages, Adjustment.stack(after), run).replaced(~changed, ended)
+        ended = through(stages, Adjustment.stack(after), run).replaced(~changed, ended)
     return ended
 
 
-def _relabelled(adjustment: Adjustment, run: Run) -> Adjustment:
+def relabelled(adjustment: Adjustment, run: Run) -> Adjustment:
     """One session with its label errors undone; the same object where there are none."""
     began = time.perf_counter()
     frames, given = adjustment.frames[0], adjustment.measurements

@@ -7,14 +7,15 @@ from dataclasses import replace
 import torch
 
 from torchstickcal.model.measurements import Measurements
-from torchstickcal.model.objective import Objective
 from torchstickcal.model.state import State
 from torchstickcal.pipeline.adjust import Adjustment
+from torchstickcal.pipeline.noise import HeldNoise, NoiseLevels
 from torchstickcal.pipeline.run import Run
 from torchstickcal.pipeline.scale import rulers, scale_factors
 from torchstickcal.pipeline.stage import StageResult
 from torchstickcal.solvers.gradients import GradientMode, attach
-from torchstickcal.solvers.newton import polish
+from torchstickcal.solvers.linearised import Linearised
+from torchstickcal.solvers.newton import minimum_near
 
 
 def attach_gradients(ended: Adjustment, data: Measurements, run: Run, mode: GradientMode) -> State:
@@ -30,19 +31,59 @@ def attach_gradients(ended: Adjustment, data: Measurements, run: Run, mode: Grad
         mode: how the gradients are computed.
     """
     state = ended.state
+    at_minima = run.settles and ended.measurements.pixels.dtype == torch.float64
     for number, result in enumerate(ended.results):
-        kept = replace(data, confidence=data.confidence.where(result.inliers, 0.0))
+        held = HeldNoise(run.noise_of(result.stage), result.gates, result.inliers)
         fixed = None if result.stage.cameras == "free" else state if number else result.minimum
-        state = attach(Objective(kept, result.losses), _polished(kept, result, fixed), mode, fixed)
+        levels = _levels(held, result, data, fixed if number else None)
+        state = attach(held, data, _minimum(held, data.detached(), result, fixed, levels, at_minima), mode, fixed, levels)
         if result.stage.rescale:
+            kept = replace(data, confidence=data.confidence.where(result.inliers, 0.0))
             factors, _ = scale_factors(kept, state.points, rulers(kept, run.config))
             state = state.scaled(factors)
     failed = torch.tensor([any(record.stop.failed for record in records) for records in ended.records])
     return state.replaced(failed.to(state.points.device), ended.state)
 
 
+def _levels(held: HeldNoise, result: StageResult, data: Measurements, before: State | None) -> NoiseLevels | None:
+    """The levels of the noise that a stage reckons with; None where they are those at its own minimum.
+
+    Args:
+        held: the noise of the stage.
+        result: where the stage ended.
+        data: the measurements.
+        before: the state before the stage, with gradients; None where that is not known.
+    """
+    if not held.noise.estimated:
+        return result.noise
+    if result.stage.cameras == "free":
+        return None
+    return result.noise if before is None else held.levels(data, before)
+
+
 @torch.no_grad()
-def _polished(measurements: Measurements, result: StageResult, fixed: State | None) -> State:
-    """A stage's minimum, to rounding: a gradient is as exact as the minimum at which it is taken."""
+def _minimum(
+    held: HeldNoise,
+    data: Measurements,
+    result: StageResult,
+    fixed: State | None,
+    levels: NoiseLevels | None,
+    at_minimum: bool,
+) -> Linearised:
+    """A stage's minimum, to rounding: a gradient is as exact as the minimum at which it is taken.
+
+    Args:
+        held: the noise of the stage.
+        data: the measurements.
+        result: where the stage ended.
+        fixed: the state with its cameras, where they were held fixed.
+        levels: of the noise; None where they are those at the minimum, and both have been found together.
+        at_minimum: whether the stage has ended there.
+    """
     start = result.minimum if fixed is None else replace(fixed, points=result.minimum.points)
-    return polish(Objective(measurements, result.losses), start, cameras_free=fixed is None)
+    if levels is None and not at_minimum:
+        return held.minimum_near(data, start)[0]
+    objective = held.objective(data, result.noise if levels is None else levels)
+    if at_minimum:
+        return Linearised(objective, start, cameras_free=fixed is None)
+    return minimum_near(lambda _: objective, start, cameras_free=fixed is None)[0]

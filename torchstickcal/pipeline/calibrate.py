@@ -6,9 +6,9 @@ import time
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, Literal, Protocol
+from typing import TYPE_CHECKING, Any, Literal, Protocol
 
-from torchstickcal.config import Config, Refine, load_config, with_refine
+from torchstickcal.config import Config, Refine, load_config, with_noise, with_refine
 from torchstickcal.errors import RigError
 from torchstickcal.losses import LOSSES
 from torchstickcal.model.unknowns import REFINEMENTS
@@ -18,9 +18,13 @@ from torchstickcal.pipeline.check import CameraCheck
 from torchstickcal.pipeline.conclude import conclude
 from torchstickcal.pipeline.run import Run
 from torchstickcal.pipeline.selection import ModelSelection
+from torchstickcal.pipeline.start import CONTRADICTED_START, Poses, starting_from
 from torchstickcal.result import Calibration
 from torchstickcal.solvers import IterationRecord, ignore_record
 from torchstickcal.workers import on_worker
+
+if TYPE_CHECKING:
+    from torchstickcal.io.rig import Rig
 
 _ = len(LOSSES), len(REFINEMENTS)  # imported now: a process that is forked while another thread imports them lacks some
 
@@ -45,6 +49,8 @@ def calibrate(
     config: str | Path | Mapping[str, Any] | Config = "default",
     callback: Callback | None = None,
     refine: Sequence[Refine] | Literal["auto"] | None = None,
+    noise: Literal["estimated", "given"] | None = None,
+    initial: Calibration | Rig | None = None,
 ) -> Calibration:
     """Find the extrinsics of all cameras and the 3D points, in metres, in the frame of the first camera.
 
@@ -55,6 +61,12 @@ def calibrate(
         refine: what else to estimate of the cameras, instead of what the configuration says: names of
             :data:`torchstickcal.model.unknowns.REFINEMENTS`, such as ``focal``, ``radial`` or ``time_offset``, or ``auto`` for
             what the keypoints contradict.
+        noise: whether the noise of the keypoints is ``estimated`` or ``given`` as ``sigma_px`` of the configuration, instead of
+            what the configuration says. Estimated, confidences compare keypoints of one point with each other; given, they set
+            the variance of each keypoint, ``sigma_px ** 2 / confidence``.
+        initial: poses of all cameras to start from, of an earlier calibration or of another program, in any frame and up to
+            scale. Cameras are matched by name, else by the last number in the names, else by order. Where no intrinsics are
+            known, its own are the start. Where the keypoints contradict the poses, they are not used, and a warning says so.
 
     Returns:
         The calibration. Its ``status`` says whether every stage converged; a stage that did not leaves the best state it found.
@@ -63,6 +75,7 @@ def calibrate(
         ConfigError: if the configuration cannot be used.
         ObservationError: if clocks are to be estimated without a frame rate.
         RigError: if the cameras cannot be placed in one rig.
+        CalibrationError: if ``initial`` lacks a camera or has no poses.
 
     Example:
         >>> from torchstickcal.simulate import golf_session
@@ -76,31 +89,42 @@ def calibrate(
     settings = load_config(config)
     if refine is not None:
         settings = with_refine(settings, refine)
+    if noise is not None:
+        settings = with_noise(settings, noise)
+    start = None
+    if initial is not None:
+        observations, start = starting_from(initial, observations)
     calibrated = _calibrated if settings.incomplete == "refuse" else _largest_part
-    return on_worker(observations.keypoints.device, calibrated, observations, settings, callback)
+    return on_worker(observations.keypoints.device, calibrated, observations, settings, callback, start)
 
 
-def _largest_part(observations: Observations, config: Config, callback: Callback | None) -> Calibration:
+def _largest_part(
+    observations: Observations, config: Config, callback: Callback | None, start: Poses | None = None
+) -> Calibration:
     """All cameras, or where they are no one rig, those of its largest part."""
     try:
-        return _calibrated(observations, config, callback)
+        return _calibrated(observations, config, callback, start)
     except RigError as error:
         if not error.parts or len(error.parts[-1]) < 2:
             raise
         left_out = tuple(name for part in error.parts[:-1] for name in part)
     cameras = [camera for camera, name in enumerate(observations.camera_labels) if name not in left_out]
     groups = [config.camera_groups[camera] for camera in cameras] if config.camera_groups else []
-    return _calibrated(observations.of_cameras(cameras), replace(config, camera_groups=groups), callback, left_out)
+    return _calibrated(observations.of_cameras(cameras), replace(config, camera_groups=groups), callback, None, left_out)
 
 
 def _calibrated(
-    observations: Observations, config: Config, callback: Callback | None, left_out: tuple[str, ...] = ()
+    observations: Observations,
+    config: Config,
+    callback: Callback | None,
+    start: Poses | None = None,
+    left_out: tuple[str, ...] = (),
 ) -> Calibration:
     began = time.perf_counter()
     if (on_start := getattr(callback, "on_start", None)) is not None:
         on_start(observations)
     run = Run(config, callback.on_iteration if callback else ignore_record)
-    models = ModelSelection(observations, run)
+    models = ModelSelection(observations, run, start)
 
     # 1. Synchronise: where the cameras' frames clearly do not belong together, find the time offsets.
     clocks = models.searched() if "time_offset" in models.allowed and models.unsynchronised else None
@@ -120,6 +144,8 @@ def _calibrated(
     unsynchronised = config.synchronise and "time_offset" not in ended.refined and models.unsynchronised
     run.took("total", time.perf_counter() - began)
     calibration = conclude(ended, check, clocks, unsynchronised, left_out, run.seconds)
+    if models.start_contradicted:
+        calibration = replace(calibration, warnings=(*calibration.warnings, CONTRADICTED_START))
     if callback:
         callback.on_end(calibration)
     return calibration

@@ -54,7 +54,7 @@ def conclude(
         translations=as_given(ended.state.translations[0]),
         points=as_given(points),
         covariance=covariance[:tangents, :tangents],
-        residuals_px=as_given(frames.to_own(_residuals(ended), torch.nan)),
+        residuals_px=as_given(frames.to_own(residuals_of(ended), torch.nan)),
         inliers=frames.to_own(inliers, False),
         stick_lengths_m=as_given((points[:, ends[:, 1]] - points[:, ends[:, 0]]).norm(dim=-1)),
         sigma_px=as_given(sigma_px),
@@ -63,7 +63,7 @@ def conclude(
         refined=ended.refined,
         unknowns={name: parameter.to(observations.keypoints.dtype) for name, parameter in unknowns.items()},
         frame_index=frames.index,
-        keypoint_index=_keypoint_index(ended),
+        keypoint_index=keypoint_index(ended),
         other_person=frames.to_own(ended.labels.other_person[0], False),
         times=_times(frames, unknowns["readout"].value[0]),
         image_size=None if size is None else size.expand(count, 2).round().long().contiguous(),
@@ -79,13 +79,13 @@ def conclude(
     )
 
 
-def _keypoint_index(ended: Adjustment) -> Tensor:
+def keypoint_index(ended: Adjustment) -> Tensor:
     """The point whose given keypoint each point uses (C, F, P), in the cameras' own frames."""
     own, index = ended.frames[0].to_own(ended.labels.index[0], -1), torch.arange(ended.observations[0].num_points)
     return torch.where(own < 0, index.to(own.device), own)
 
 
-def _residuals(ended: Adjustment) -> Tensor:
+def residuals_of(ended: Adjustment) -> Tensor:
     """Projections minus keypoints (C, G, P, 2) at the common frames, pixels; NaN where not seen or the point is not known."""
     measurements = ended.measurements
     known = measurements.visible & ended.last.inliers.any(1, keepdim=True)

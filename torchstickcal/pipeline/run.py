@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 from torchstickcal.config import Config, Stage
+from torchstickcal.pipeline.noise import StageNoise
 from torchstickcal.solvers import Listener, ignore_record
 
 
@@ -16,11 +17,14 @@ class Run:
         config: the configuration.
         listener: hears every iteration.
         seconds: time by step, which the steps add to.
+        to_rounding: whether the last camera stage and those after it are taken to their minima up to rounding errors, for
+            gradients. Their solver then only has to come near.
     """
 
     config: Config
     listener: Listener = ignore_record
     seconds: dict[str, float] = field(default_factory=dict)
+    to_rounding: bool = False
 
     @property
     def camera_stages(self) -> dict[str, Stage]:
@@ -31,6 +35,16 @@ class Run:
     def point_stages(self) -> dict[str, Stage]:
         """The stages after it, in which the cameras are fixed."""
         return dict(self._stages[self._number_of_camera_stages :])
+
+    def noise_of(self, stage: Stage) -> StageNoise:
+        """The noise that a stage reckons with."""
+        return StageNoise(stage, self.config.given_sigma_px)
+
+    @property
+    def settles(self) -> bool:
+        """Whether the last camera stage takes its noise from the data, so that both have to be brought to agree."""
+        *_, stage = self.camera_stages.values()
+        return stage.cameras == "free" and self.noise_of(stage).estimated
 
     def took(self, step: str, seconds: float) -> None:
         """Add to the time of a step."""

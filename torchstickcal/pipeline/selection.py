@@ -38,6 +38,10 @@ _CLEARLY_BETTER = 0.5
 """Median squared residual at other time offsets, relative to that at the given ones, up to which they are tried."""
 _FITTING_SHARE, _FITTING_FOCAL_SHARE = 0.6, 0.01
 """Least fraction of inliers, and largest noise as a fraction of the focal length, of cameras that fit together."""
+_CLEAR_SHARE, _CLEAR_FOCAL_SHARE = 0.8, 0.003
+"""The same of cameras that were started from given poses and need no comparison with cameras that were not."""
+_CLEARLY_LESS = 0.5
+"""Squared residual, relative to another, from which on it is clearly less."""
 
 
 class ModelSelection:
@@ -46,13 +50,16 @@ class ModelSelection:
     Args:
         observations: the session.
         run: what all steps share.
+        start: poses to start from, as of :func:`torchstickcal.pipeline.adjust.begin`.
 
     Raises:
         ObservationError: if the configuration names something to refine that the session does not allow.
     """
 
-    def __init__(self, observations: Observations, run: Run) -> None:
-        self._observations, self._run = observations, run
+    def __init__(self, observations: Observations, run: Run, start: tuple[Tensor, Tensor] | None = None) -> None:
+        self._observations, self._run, self._start = observations, run, start
+        self.start_contradicted = False
+        """whether the poses to start from were given up, because others fit the keypoints and they do not"""
         config = run.config
         self.named = () if config.refine == "auto" else tuple(config.refine)
         """what the configuration refines"""
@@ -90,6 +97,30 @@ class ModelSelection:
         Raises:
             RigError: if the cameras cannot be placed in one rig.
         """
+        found, clocks = self._found(clocks)
+        if self._start is not None and not any(_fits(one, _CLEAR_SHARE, _CLEAR_FOCAL_SHARE) for one in found):
+            found, clocks = self._without_start(found, clocks)
+        best = min(found, key=_median_squared_residual)
+        return best if set(self.named) <= set(best.refined) else self._with(best, self.named), clocks
+
+    def _without_start(
+        self, found: list[Adjustment], clocks: ClockEstimate | None
+    ) -> tuple[list[Adjustment], ClockEstimate | None]:
+        """What was found from the poses to start from or, where that is clearly better, what is found without them."""
+        start, self._start = self._start, None
+        try:
+            others, own_clocks = self._found(clocks)
+        except RigError:
+            others, own_clocks = [], clocks
+        least = min(map(_median_squared_residual, found))
+        self.start_contradicted = any(_median_squared_residual(other) < _CLEARLY_LESS * least for other in others)
+        if self.start_contradicted:
+            return others, own_clocks
+        self._start = start
+        return found, clocks
+
+    def _found(self, clocks: ClockEstimate | None) -> tuple[list[Adjustment], ClockEstimate | None]:
+        """What was adjusted at all time offsets that were tried; arguments and errors as of :meth:`adjusted`."""
         found = [] if clocks is None else self._at_offsets(clocks)
         failure: RigError | None = None
         if not any(map(_fits, found)):
@@ -102,8 +133,7 @@ class ModelSelection:
             found += self._at_offsets(clocks)
         if not found and failure is not None:
             raise failure
-        best = min(found, key=_median_squared_residual)
-        return best if set(self.named) <= set(best.refined) else self._with(best, self.named), clocks
+        return found, clocks
 
     def refined_where_contradicted(self, adjusted: Adjustment, check: CameraCheck) -> tuple[Adjustment, CameraCheck]:
         """Adjusted with what the keypoints contradict of the cameras, the most contradicted first, and checked again.
@@ -164,7 +194,7 @@ class ModelSelection:
 
     def _adjusted_at(self, refined: Sequence[str], offsets_frames: Tensor | None = None) -> Adjustment:
         """Initialised and adjusted at some time offsets (C,) of the cameras, in frames; None for those given."""
-        begun = begin(self._observations, self._run, refined, offsets_frames)
+        begun = begin(self._observations, self._run, refined, offsets_frames, poses=self._start)
         return self._at_nearest_frames(adjust_cameras(begun, self._run))
 
     def _with(self, adjustment: Adjustment, refined: Sequence[str]) -> Adjustment:
@@ -199,11 +229,13 @@ class ModelSelection:
         return names
 
 
-def _fits(adjustment: Adjustment) -> bool:
+def _fits(
+    adjustment: Adjustment, least_share: float = _FITTING_SHARE, largest_focal_share: float = _FITTING_FOCAL_SHARE
+) -> bool:
     """Whether the cameras agree with one another as those of one scene do."""
     share = adjustment.last.inliers.sum() / adjustment.measurements.visible.sum()
     noise = adjustment.last.sigma_px.median() / adjustment.measurements.cameras.focal_px.mean()
-    return adjustment.converged and float(share) > _FITTING_SHARE and float(noise) < _FITTING_FOCAL_SHARE
+    return adjustment.converged and float(share) > least_share and float(noise) < largest_focal_share
 
 
 def _median_squared_residual(adjustment: Adjustment) -> float:

@@ -10,25 +10,23 @@ import torch
 from torch import Tensor
 
 from torchstickcal.config import Stage
-from torchstickcal.losses import Loss, LossContext, LossSettings, TrackLoss
-from torchstickcal.model.correlation import error_correlation
+from torchstickcal.losses import Loss
 from torchstickcal.model.measurements import Measurements
-from torchstickcal.model.noise import estimate_acceleration_m, estimate_sigma_px
+from torchstickcal.model.noise import NEAR_SIGMAS, near_keypoints
 from torchstickcal.model.objective import Objective
 from torchstickcal.model.state import State
+from torchstickcal.pipeline.noise import Chosen, NoiseGates, NoiseLevels
 from torchstickcal.pipeline.run import Run
 from torchstickcal.pipeline.scale import rulers, scale_factors
 from torchstickcal.solvers import StageRecord, Stop, Termination, solver
-from torchstickcal.solvers.elimination.normal_equations import NormalEquations
 
 _RESOLUTION = {torch.float64: 0.0, torch.float32: 1e-6}
 """Relative decrease of the cost that can be told from rounding."""
+_ROUGHLY = 1e-3
+"""Relative decrease of the cost from which on a state is near the minimum."""
 _LEAST_AGREEING_SHARE = 0.15
 """Share of a camera's keypoints that must agree with the other cameras. Sound cameras have more than 0.8, cameras that see
 another scene 0.3 to 0.4; by chance some always agree."""
-_CONTRAST = 1.0
-"""Variance between points, of the logarithm of the errors that last, in their weights. A stick's ends are often tracked better
-than joints, which are many: seen as one group, they would look like them."""
 
 
 class StageResult(NamedTuple):
@@ -41,12 +39,22 @@ class StageResult(NamedTuple):
     losses: dict[str, Loss]
     inliers: Tensor
     """(B, C, N), True where a keypoint took part"""
-    sigma_px: Tensor
-    """(B, P), noise of each point's keypoints, estimated before the stage, pixels"""
-    correlation_frames: Tensor
-    """(B, P), as many keypoints of each point counted as one, because their errors are alike"""
+    noise: NoiseLevels
+    """with which the losses reckon, as estimated where the stage began"""
+    gates: NoiseGates
+    """what was decided about it"""
     records: tuple[StageRecord, ...]
     """one for each session"""
+
+    @property
+    def sigma_px(self) -> Tensor:
+        """(B, P), estimated noise of each point's keypoints, pixels."""
+        return self.noise.sigma_px
+
+    @property
+    def correlation_frames(self) -> Tensor:
+        """(B, P), as many keypoints of each point counted as one, because their errors are alike."""
+        return self.noise.correlation_frames
 
     def replaced(self, where: Tensor, other: StageResult) -> StageResult:
         """The result with some sessions (B,), True where, taken from another of the same stage."""
@@ -56,8 +64,8 @@ class StageResult(NamedTuple):
             self.minimum.replaced(where, other.minimum),
             {name: loss.replaced(where, other.losses[name]) for name, loss in self.losses.items()},
             torch.where(where[:, None, None], other.inliers, self.inliers),
-            torch.where(where[:, None], other.sigma_px, self.sigma_px),
-            torch.where(where[:, None], other.correlation_frames, self.correlation_frames),
+            self.noise.replaced(where, other.noise),
+            self.gates.replaced(where, other.gates),
             tuple(new if taken else old for old, new, taken in zip(self.records, other.records, where.tolist(), strict=True)),
         )
 
@@ -68,6 +76,7 @@ def run_stage(
     measurements: Measurements,
     state: State,
     run: Run,
+    roughly: bool = False,
 ) -> StageResult:
     """Run one stage from a state, for all sessions.
 
@@ -77,22 +86,27 @@ def run_stage(
         measurements: the sessions.
         state: where it starts.
         run: what all steps share.
+        roughly: whether it is enough to come near the minimum.
     """
     began, given = time.perf_counter(), measurements
     squared_residuals = measurements.squared_residuals(state)
-    sigma_px = estimate_sigma_px(measurements, squared_residuals)
+    near = Chosen(near_keypoints(measurements, squared_residuals), NEAR_SIGMAS)
+    sigma_px = near.sigma_px(measurements, squared_residuals)
     if stage.reject_sigmas is not None:
         limits = (stage.reject_sigmas * sigma_px).square().to(squared_residuals)
         agreeing = measurements.by_frame(squared_residuals) <= limits[:, None, None]
         measurements = measurements.keeping(agreeing.flatten(2))
+    noise = run.noise_of(stage)
+    chosen = near if stage.cameras == "free" else noise.chosen(measurements, lambda: near)
+    losses, levels, gates = noise.decided(measurements, state, squared_residuals, chosen)
     del squared_residuals
-    losses, correlation_frames = _losses(stage, measurements, state, sigma_px)
     objective = Objective(measurements, losses)
+    least = _ROUGHLY if roughly and run.config.solver == "gauss_newton" else _RESOLUTION[measurements.pixels.dtype]
     outcome = solver(run.config.solver)(
         objective,
         state,
         cameras_free=stage.cameras == "free",
-        termination=Termination(stage.max_iterations, max(stage.cost_tolerance, _RESOLUTION[measurements.pixels.dtype])),
+        termination=Termination(stage.max_iterations, max(stage.cost_tolerance, least)),
         stage=name,
         listener=run.listener,
     )
@@ -107,7 +121,7 @@ def run_stage(
     ended = zip(stops, outcome.iterations, strict=True)
     records = tuple(StageRecord(name, stop, seconds, iterations) for stop, iterations in ended)
     inliers = measurements.visible
-    return StageResult(stage, state, minimum, losses, inliers, sigma_px, correlation_frames, records)
+    return StageResult(stage, state, minimum, losses, inliers, levels, gates, records)
 
 
 def agreeing_cameras(given: Measurements, kept: Measurements) -> Tensor:
@@ -130,29 +144,3 @@ def _determined(given: Measurements, kept: Measurements) -> Tensor:
 def _judged(stops: Sequence[Stop], verdict: Stop, applies: Tensor) -> tuple[Stop, ...]:
     """Why each session stopped, with a verdict in place of convergence where it applies, (B,)."""
     return tuple(verdict if stop.converged and bad else stop for stop, bad in zip(stops, applies.tolist(), strict=True))
-
-
-def _losses(stage: Stage, measurements: Measurements, state: State, sigma_px: Tensor) -> tuple[dict[str, Loss], Tensor]:
-    """The losses of a stage, and how many keypoints of each point count as one in them, (B, P).
-
-    Track losses come last: their sigma may be estimated with the others at hand.
-    """
-    losses: dict[str, Loss] = {}
-    times = torch.ones_like(sigma_px)
-
-    def correlation_frames(given: float | str) -> Tensor:
-        lasting = error_correlation(measurements, state, sigma_px, _CONTRAST).times if given == "estimated" else given
-        return times.copy_(torch.as_tensor(lasting))
-
-    def acceleration_m() -> Tensor:
-        system = NormalEquations(Objective(measurements, losses), state, cameras_free=False)
-        return estimate_acceleration_m(measurements, state.points, system.point_variance())
-
-    def is_track(named: tuple[str, LossSettings]) -> bool:
-        return issubclass(named[1].loss, TrackLoss)
-
-    given = measurements.point_index, measurements.stick_sigma_m, sigma_px
-    context = LossContext(*given, correlation_frames, acceleration_m)
-    for name, settings in sorted(stage.losses.items(), key=is_track):
-        losses[name] = settings.build(context)
-    return losses, times

@@ -43,7 +43,7 @@ def warnings_of(
         unsynchronised: whether the motion contradicts the clocks, which were not estimated.
         left_out: names of the cameras that are no part of the rig.
     """
-    found = [*ended.observations[0].warnings, *_left_out(left_out), *_labels(ended), *_keypoints(ended), *_same_views(ended)]
+    found = [*_left_out(left_out), *keypoint_warnings(ended), *_same_views(ended)]
     if len(ended.measurements.sticks) > 1:
         found += _contradicted_lengths(ended)
     for name, unknown in all_unknowns().items():
@@ -58,6 +58,11 @@ def warnings_of(
         if reason:
             found.append(f"{ended.observations[0].camera_label(camera)}: its time offset is uncertain, {reason}.")
     return tuple(found)
+
+
+def keypoint_warnings(ended: Adjustment) -> tuple[str, ...]:
+    """Warnings about the keypoints alone."""
+    return (*ended.observations[0].warnings, *_labels(ended), *_keypoints(ended))
 
 
 def _left_out(cameras: tuple[str, ...]) -> list[str]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from typing import Any
 
 from torch import Tensor
@@ -34,11 +35,11 @@ def table(calibration: Calibration) -> str:
         ]
         for name, centre, std_m, std_deg, px, used in cameras
     ]
-    text = [_aligned(rows), ""]
+    text = [aligned(rows), _frame(calibration), ""]
     for name, parameter in calibration.unknowns.items():
         known = bool(parameter.by_component("suggested").isfinite().any())
         if known and (parameter.refined or all_unknowns()[name].noticeable_prior_share is not None):
-            text += [_aligned(_parameter_rows(calibration, parameter)), ""]
+            text += [aligned(_parameter_rows(calibration, parameter)), ""]
     if calibration.sticks:
         rows = [["stick", "given (m)", "mean (m)", "spread (mm)", "frames"]]
         for stick, lengths in zip(calibration.sticks, calibration.stick_lengths_m.mT, strict=True):
@@ -47,14 +48,14 @@ def table(calibration: Calibration) -> str:
             ends = " - ".join(printable(_point_name(calibration, end)) for end in stick.ends)
             mean = f"{float(known.mean()):.5f}" if len(known) else "-"
             rows.append([ends, f"{stick.length_m:.5f}", mean, spread, str(len(known))])
-        text += [_aligned(rows), ""]
+        text += [aligned(rows), ""]
     rows = [["stage", "iterations", "cost", "time (ms)", ""]]
     rows.append(["initialise", "", "", f"{1000 * calibration.seconds['initialise']:.1f}", ""])
     for stage in calibration.stages:
         last = stage.iterations[-1]
         rows.append([stage.name, str(last.iteration), f"{last.cost:.6g}", f"{1000 * stage.seconds:.1f}", str(stage.stop)])
     rows.append(["total", "", "", f"{1000 * calibration.seconds['total']:.1f}", ""])
-    text.append(_aligned(rows))
+    text.append(aligned(rows))
     text += ["", *(f"warning: {warning}" for warning in calibration.warnings)] if calibration.warnings else []
     return "\n".join(text)
 
@@ -65,6 +66,7 @@ def summary(calibration: Calibration) -> dict[str, Any]:
         {
             "status": calibration.status,
             "converged": calibration.converged,
+            "world": dataclasses.asdict(calibration.world),
             "cameras": [
                 {
                     "name": name,
@@ -127,6 +129,15 @@ def summary(calibration: Calibration) -> dict[str, Any]:
     )
 
 
+def _frame(calibration: Calibration) -> str:
+    """The frame of the world, and how well it is known, in one line."""
+    world = calibration.world
+    known = ""
+    if world.vertical_std_deg is not None and world.floor_std_m is not None:
+        known = f" Vertical ± {world.vertical_std_deg:.1f} deg, floor ± {1000 * world.floor_std_m:.0f} mm."
+    return world.description + known
+
+
 def printable(text: str) -> str:
     r"""A text for one place in a table: line ends and other characters that have no shape of their own are escaped.
 
@@ -185,7 +196,8 @@ def _point_name(calibration: Calibration, index: int) -> str:
     return calibration.point_names[index] if calibration.point_names else f"point {index}"
 
 
-def _aligned(rows: list[list[str]]) -> str:
+def aligned(rows: list[list[str]]) -> str:
+    """Rows of cells as a table, the first row as its head."""
     widths = [max(len(row[column]) for row in rows) for column in range(len(rows[0]))]
     lines = [
         "  ".join(cell.ljust(w) if column == 0 or (not cell[:1].isdigit() and cell[:1] not in "- ") else cell.rjust(w)

@@ -88,7 +88,9 @@ def _draw_athlete(axes: Axes3D, calibration: Calibration, points: NDArray[np.flo
 
 
 def plot_rotation(calibration: Calibration) -> Tensor:
-    """Rotation (3, 3) from the world to the plot, where the mean up direction of the cameras is +z."""
+    """Rotation (3, 3) from the world to the plot, where +z is up: as the world says, else the cameras' mean up direction."""
+    if calibration.world.up == "z":
+        return torch.eye(3, dtype=torch.float64)
     up = torch.nn.functional.normalize(-calibration.rotations.double().cpu()[:, 1].mean(0), dim=0)
     forward = calibration.rotations.double().cpu()[0, 2]
     right = torch.nn.functional.normalize(torch.linalg.cross(forward, up), dim=0)

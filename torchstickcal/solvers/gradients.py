@@ -1,9 +1,12 @@
-"""Gradients through a minimisation, by the implicit function theorem.
+"""Gradients through a minimum, by the implicit function theorem.
 
-At a minimum theta the gradient g(theta, y) of the objective is zero for any data y. So d theta / dy = -H^-1 dg/dy with the
-exact Hessian H. The backward pass solves one linear system in H, ``H v = u`` with the incoming gradient u. Then it
-differentiates the directional derivative ``g . v`` with respect to the data. The gradient modes differ in how they solve the
-linear system.
+At a minimum theta the gradient ``g(theta, y)`` of the objective is zero for any data y. So d theta / dy = -G^-1 dg/dy with the
+derivative G of g by theta. Where nothing else depends on theta, G is the exact Hessian H. The noise that the objective reckons
+with may be estimated at the minimum itself, as levels ``n(theta, y)``. Then G = H + dg/dn dn/dtheta.
+
+The backward pass solves one linear system, ``G^T v = u`` with the incoming gradient u. Then it differentiates the directional
+derivative ``g . v`` with respect to the data, directly and by the levels. The gradient modes differ in how they solve linear
+systems in H. The levels are few, so that a short iteration leads from H to G.
 
 Reference: Gould et al., "On differentiating parameterized argmin and argmax problems with application to bi-level
 optimization", 2016.
@@ -11,47 +14,51 @@ optimization", 2016.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any, NamedTuple, Protocol
+from typing import Any, Protocol
 
 import torch
 from torch import Tensor
-from torch.nn.functional import pad
 
 from torchstickcal.errors import ConfigError
 from torchstickcal.geometry.cameras import Intrinsics
 from torchstickcal.losses import Quadratic
+from torchstickcal.model.measurements import Measurements
 from torchstickcal.model.objective import Objective
 from torchstickcal.model.state import State
-from torchstickcal.solvers.elimination.normal_equations import NormalEquations
+from torchstickcal.solvers.acceleration import Acceleration
+from torchstickcal.solvers.linearised import Linearised, Tangent, slope_along, tangent_gradient
 from torchstickcal.workers import on_worker
 
 _RIG_INPUTS = 3
 """Number of inputs that describe the rig: rotations, translations, lens and clock unknowns. They come first."""
-_DAMPINGS = (0.0, 1e-10, 1e-7)
-"""Damping values, tried in turn until the Hessian is positive definite. It is singular if nothing determines the scale; the
-damping then does not change gradients orthogonal to that direction."""
+_DATA_INPUTS = 6
+"""Number of inputs after them that describe the measurements. Levels of the noise come last."""
+_MAX_ROUNDS = 20
+_ACCURACY = 1e-8
+"""Length of a step towards the adjoint v, as a share of its own, below which it has converged."""
+
+Levels = tuple[Tensor, ...]
+"""Numbers that say how large the errors are."""
 
 
-class Tangent(NamedTuple):
-    """A step of the unknowns of B sessions, or a gradient with respect to them."""
+class NoiseModel(Protocol):
+    """An objective that reckons with the noise that is found at a state."""
 
-    cameras: Tensor
-    """(B, C', 6), tangents of the C' free cameras"""
-    unknowns: Tensor
-    """(B, K), lens and clock unknowns; (B, 0) if the cameras are held fixed"""
-    points: Tensor
-    """(B, 3, N)"""
+    def levels(self, measurements: Measurements, state: State) -> Levels:
+        """The levels of the noise at a state, differentiable by measurements and state."""
+        ...
 
-    def plus(self, other: Tangent, factor: float = 1.0) -> Tangent:
-        """This plus ``factor`` times another."""
-        return Tangent(*(mine + factor * theirs for mine, theirs in zip(self, other, strict=True)))
+    def objective(self, measurements: Measurements, levels: Levels) -> Objective:
+        """The objective with some levels, differentiable by measurements and levels."""
+        ...
 
 
 class GradientMode(Protocol):
     """A way to solve the linear system of the backward pass."""
 
-    def solve(self, objective: Objective, state: State, cameras_free: bool, gradient: Tangent) -> Tangent:
+    def solve(self, minimum: Linearised, gradient: Tangent) -> Tangent:
         """``H^-1`` times a gradient, with the Hessian at a minimum. Zero for sessions whose system cannot be solved."""
         ...
 
@@ -71,8 +78,8 @@ class Implicit:
         torch.Size([3, 5, 21, 2])
     """
 
-    def solve(self, objective: Objective, state: State, cameras_free: bool, gradient: Tangent) -> Tangent:
-        return _solve(objective, state, cameras_free, gradient, exact=True)
+    def solve(self, minimum: Linearised, gradient: Tangent) -> Tangent:
+        return minimum.solve(gradient)
 
 
 @dataclass(frozen=True)
@@ -92,8 +99,8 @@ class GaussNewton:
         torch.Size([3, 5, 21, 2])
     """
 
-    def solve(self, objective: Objective, state: State, cameras_free: bool, gradient: Tangent) -> Tangent:
-        return _solve(objective, state, cameras_free, gradient, exact=False)
+    def solve(self, minimum: Linearised, gradient: Tangent) -> Tangent:
+        return minimum.solve(gradient, exact=False)
 
 
 @dataclass(frozen=True)
@@ -120,11 +127,11 @@ class Unrolled:
 
     iterations: int = 5
 
-    def solve(self, objective: Objective, state: State, cameras_free: bool, gradient: Tangent) -> Tangent:
-        solution = _solve(objective, state, cameras_free, gradient, exact=False)
+    def solve(self, minimum: Linearised, gradient: Tangent) -> Tangent:
+        solution = minimum.solve(gradient, exact=False)
         for _ in range(self.iterations - 1):
-            residual = gradient.plus(_hessian_product(objective, state, solution), -1.0)
-            solution = solution.plus(_solve(objective, state, cameras_free, residual, exact=False))
+            residual = gradient.plus(minimum.hessian_times(solution), -1.0)
+            solution = solution.plus(minimum.solve(residual, exact=False))
         return solution
 
 
@@ -140,35 +147,44 @@ def gradient_mode(mode: str | GradientMode) -> GradientMode:
     return named[mode] if isinstance(mode, str) else mode
 
 
-def attach(objective: Objective, minimum: State, mode: GradientMode, fixed: State | None = None) -> State:
-    """A copy of a minimum that carries gradients with respect to the measurements of its objective.
+def attach(
+    model: NoiseModel,
+    measurements: Measurements,
+    minimum: Linearised,
+    mode: GradientMode,
+    fixed: State | None = None,
+    levels: Levels | None = None,
+) -> State:
+    """A copy of a minimum that carries gradients with respect to the measurements.
 
     If clocks are among the unknowns, the velocity of the keypoints in the image is treated as a constant.
 
     Args:
-        objective: the minimised objective. Pixels, confidence, cameras, lengths and priors of its measurements may require
-            gradients.
-        minimum: the state that minimises the objective.
-        mode: how to solve the linear system of the backward pass.
+        model: the objective, and the noise that it reckons with.
+        measurements: what was measured. Pixels, confidence, cameras, lengths and priors may require gradients.
+        minimum: the minimised objective at its minimum.
+        mode: how to solve linear systems in the Hessian.
         fixed: if the cameras were held fixed, the state with their rotations, translations, lens and clock unknowns, which may
             require gradients; None if they were estimated.
+        levels: of the noise, where they do not belong to the minimum itself; they may require gradients. None where they do.
 
     Raises:
         ConfigError: if the gradients are to be exact, and a track loss has a robust kernel, whose curvature is not computed.
     """
-    curved = [name for name, loss in objective.track_losses.items() if not isinstance(loss.kernel, Quadratic)]
+    tracks = minimum.objective.track_losses
+    curved = [name for name, loss in tracks.items() if not isinstance(loss.kernel, Quadratic)]
     if curved and isinstance(mode, Implicit):
         raise ConfigError(
             "exact gradients need track losses without a robust kernel",
             where=f"loss {', '.join(curved)}",
-            got=", ".join(type(objective.track_losses[name].kernel).__name__ for name in curved),
+            got=", ".join(type(tracks[name].kernel).__name__ for name in curved),
             expected="no kernel",
             remedy="Or choose gradient='gauss_newton', an approximation.",
         )
-    m, rig = objective.measurements, fixed or minimum
+    m, rig = measurements, fixed or minimum.state
     cameras = (rig.rotations, rig.translations, rig.unknowns)
     data = (m.pixels, m.confidence, m.lengths_m, m.cameras.matrix, m.cameras.distortion, m.unknowns.prior_sigma)
-    return State(*_Minimum.apply(objective, minimum, mode, fixed is None, *cameras, *data))
+    return State(*_Minimum.apply(model, m.detached(), minimum, mode, *cameras, *data, *(levels or ())))
 
 
 class _Minimum(torch.autograd.Function):
@@ -176,11 +192,12 @@ class _Minimum(torch.autograd.Function):
 
     @staticmethod
     def forward(  # pyright: ignore[reportIncompatibleMethodOverride]
-        ctx: Any, objective: Objective, minimum: State, mode: GradientMode, cameras_free: bool, *inputs: Tensor | None
+        ctx: Any, model: NoiseModel, measurements: Measurements, minimum: Linearised, mode: GradientMode, *inputs: Tensor | None
     ) -> tuple[Tensor, ...]:
-        ctx.objective, ctx.minimum, ctx.mode, ctx.cameras_free = objective, minimum, mode, cameras_free
+        ctx.model, ctx.measurements, ctx.minimum, ctx.mode = model, measurements, minimum, mode
         ctx.save_for_backward(*inputs)
-        return tuple(v.clone() for v in (minimum.rotations, minimum.translations, minimum.points, minimum.unknowns))
+        state = minimum.state
+        return tuple(v.clone() for v in (state.rotations, state.translations, state.points, state.unknowns))
 
     @staticmethod
     @torch.autograd.function.once_differentiable
@@ -189,105 +206,127 @@ class _Minimum(torch.autograd.Function):
 
     @staticmethod
     def _backward(ctx: Any, *gradients: Tensor) -> tuple[Any, ...]:
-        by_rotations, by_translations, by_points, by_unknowns = gradients
-        minimum, inputs = ctx.minimum, [None if v is None else v.detach() for v in ctx.saved_tensors]
+        minimum, needed = ctx.minimum, ctx.needs_input_grad[4:]
+        at, free = minimum.state, minimum.cameras_free
+        incoming = State(*gradients)
+        known = minimum.objective.measurements.active[:, None]
+        gradient = tangent_gradient(at, replace(incoming, points=incoming.points.where(known, 0.0)), free)
 
-        # 1. Solve H v = u. Cameras that are held fixed have no rows in this system.
-        objective = _with_data(ctx.objective, inputs[_RIG_INPUTS:])
-        gradient = Tangent(
-            _tangent_gradient(minimum.rotations, by_rotations, by_translations)[:, 1:],
-            by_unknowns,
-            by_points.where(objective.measurements.active[:, None], 0.0),
-        )
-        if not ctx.cameras_free:
-            gradient = gradient._replace(cameras=gradient.cameras[:, :0], unknowns=by_unknowns[:, :0])
-        adjoint = _for_all_cameras(minimum, ctx.mode.solve(objective, minimum, ctx.cameras_free, gradient))
-
-        # 2. Differentiate -g . v with respect to the inputs.
-        needed = ctx.needs_input_grad[4:]
-        leaves = [None if v is None else v.requires_grad_(need) for v, need in zip(inputs, needed, strict=True)]
+        # 1. The objective once more, differentiable by all inputs and by the levels of the noise.
+        inputs = zip(ctx.saved_tensors, needed, strict=True)
+        leaves = [None if v is None else v.detach().requires_grad_(need) for v, need in inputs]
+        rig, data, given = leaves[:_RIG_INPUTS], leaves[_RIG_INPUTS:][:_DATA_INPUTS], leaves[_RIG_INPUTS + _DATA_INPUTS :]
         with torch.enable_grad():
-            state = minimum
-            if not ctx.cameras_free:
-                rotations, translations, unknowns = leaves[:_RIG_INPUTS]
-                state = replace(minimum, rotations=rotations, translations=translations, unknowns=unknowns)
-            slope = _slope(_with_data(ctx.objective, leaves[_RIG_INPUTS:]), state, adjoint)
+            objective, levels = _objective(ctx.model, _with_data(ctx.measurements, data), at, given)
+
+            # 2. Solve G^T v = u. Cameras that are held fixed have no rows in this system.
+            adjoint = _adjoint(minimum, ctx.mode, gradient, objective, levels)
+
+            # 3. Differentiate -g . v with respect to the inputs.
+            state = at if free else replace(at, rotations=rig[0], translations=rig[1], unknowns=rig[2])
+            slope = -slope_along(objective, state, adjoint)
             differentiable = [leaf for leaf in leaves if leaf is not None and leaf.requires_grad]
-            found = iter(torch.autograd.grad(-slope, differentiable, allow_unused=True))
+            found = iter(levels.total(slope, differentiable))
         by_inputs = [next(found) if leaf is not None and leaf.requires_grad else None for leaf in leaves]
         by_inputs = [None if v is None else _where_nonzero(adjoint, v) for v in by_inputs]
 
-        # 3. Cameras that are held fixed are also passed through unchanged: add the incoming gradient.
-        if not ctx.cameras_free:
+        # 4. Cameras that are held fixed are also passed through unchanged: add the incoming gradient.
+        if not free:
+            passed = (incoming.rotations, incoming.translations, incoming.unknowns)
             by_inputs[:_RIG_INPUTS] = [
                 direct if through_points is None else direct + through_points
-                for direct, through_points in zip(
-                    (by_rotations, by_translations, by_unknowns), by_inputs[:_RIG_INPUTS], strict=True
-                )
+                for direct, through_points in zip(passed, by_inputs[:_RIG_INPUTS], strict=True)
             ]
         return None, None, None, None, *by_inputs
 
 
-def _solve(objective: Objective, state: State, cameras_free: bool, gradient: Tangent, exact: bool) -> Tangent:
-    """``H^-1`` times a gradient, with the smallest of the damping values that makes H positive definite."""
-    dampings = torch.zeros(len(gradient.points), dtype=torch.float64, device=gradient.points.device)
-    *solution, solved = NormalEquations(objective, state, cameras_free, dampings, exact).solve(*gradient)
-    for damping in _DAMPINGS[1:]:
-        if bool(solved.all()):
+class _Levels:
+    """The levels of the noise that an objective reckons with, as leaves, and what they follow from.
+
+    Args:
+        found: as functions of a state and of what was measured; empty where they were given.
+        used: as the objective uses them.
+        state: the state.
+    """
+
+    def __init__(self, found: Levels, used: Levels, state: State) -> None:
+        follow = [(level, leaf) for level, leaf in zip(found, used, strict=False) if level.requires_grad]
+        self._found, self._used = [level for level, _ in follow], [leaf for _, leaf in follow]
+        self._state = state
+
+    @property
+    def follow(self) -> bool:
+        """Whether any of them follows from the state."""
+        return bool(self._found)
+
+    def by_state(self, slope: Tensor) -> State:
+        """The derivative of a slope by the state, through the levels alone."""
+        (by_levels,) = [_derivatives(slope, self._used)]
+        return State(*_derivatives(self._found, list(vars(self._state).values()), by_levels))
+
+    def total(self, slope: Tensor, leaves: Sequence[Tensor]) -> list[Tensor]:
+        """The derivatives of a slope by leaves, directly and through the levels."""
+        direct = _derivatives(slope, [*leaves, *self._used])
+        through = _derivatives(self._found, leaves, direct[len(leaves) :]) if self.follow else [torch.zeros(())] * len(leaves)
+        return [a + b.to(a) for a, b in zip(direct, through, strict=False)]
+
+
+def _derivatives(of: Tensor | Sequence[Tensor], by: Sequence[Tensor], weights: Sequence[Tensor] | None = None) -> list[Tensor]:
+    return list(torch.autograd.grad(of, by, weights, retain_graph=True, allow_unused=True, materialize_grads=True))
+
+
+def _objective(
+    model: NoiseModel, measurements: Measurements, at: State, given: Sequence[Tensor | None]
+) -> tuple[Objective, _Levels]:
+    """The objective, with the given levels, or with those of a state where none are given."""
+    state = at.leaves()
+    found = () if given else model.levels(measurements, state)
+    used = tuple(level for level in given if level is not None) or tuple(level.detach().requires_grad_() for level in found)
+    return model.objective(measurements, used), _Levels(found, used, state)
+
+
+def _adjoint(minimum: Linearised, mode: GradientMode, gradient: Tangent, objective: Objective, levels: _Levels) -> Tangent:
+    """The solution of ``G^T v = u``.
+
+    Args:
+        minimum: the objective at its minimum.
+        mode: how to solve linear systems in the Hessian.
+        gradient: u.
+        objective: the same, differentiable by the levels.
+        levels: of the noise.
+    """
+    adjoint = mode.solve(minimum, gradient)
+    if not levels.follow:
+        return adjoint
+    times_hessian, whole, acceleration = gradient, adjoint.dot(gradient).abs(), Acceleration()
+    for _ in range(_MAX_ROUNDS):
+        by_levels = levels.by_state(slope_along(objective, minimum.state, adjoint))
+        through = tangent_gradient(minimum.state, by_levels, minimum.cameras_free)
+        residual = gradient.plus(through, -1.0).plus(times_hessian, -1.0)
+        step = mode.solve(minimum, residual)
+        missing = step.dot(residual).abs() > _ACCURACY**2 * whole
+        if not bool(missing.any()):
             break
-        dampings = dampings.where(solved, damping)
-        *solution, solved = NormalEquations(objective, state, cameras_free, dampings, exact).solve(*gradient)
-    return Tangent(*(part.where(solved.view(-1, *[1] * (part.ndim - 1)), 0.0) for part in solution))
-
-
-def _hessian_product(objective: Objective, state: State, vector: Tangent) -> Tangent:
-    """The exact Hessian times a vector: the derivative of the slope along the vector."""
-    with torch.enable_grad():
-        leaves = [v.detach().requires_grad_() for v in (state.rotations, state.translations, state.points, state.unknowns)]
-        slope = _slope(objective, State(*leaves), _for_all_cameras(state, vector))
-        found = torch.autograd.grad(slope, leaves, allow_unused=True, materialize_grads=True)
-    by_rotations, by_translations, by_points, by_unknowns = found
-    by_cameras = _tangent_gradient(state.rotations, by_rotations, by_translations)
-    fixed = by_cameras.shape[1] - vector.cameras.shape[1]
-    return Tangent(by_cameras[:, fixed:], by_unknowns[:, : vector.unknowns.shape[1]], by_points)
-
-
-def _slope(objective: Objective, state: State, step: Tangent) -> Tensor:
-    """Half the directional derivative of the objective along a step: ``g . step``."""
-    return objective.slope(state, step.cameras, step.points, step.unknowns)
-
-
-def _tangent_gradient(rotations: Tensor, by_rotations: Tensor, by_translations: Tensor) -> Tensor:
-    """Gradient (B, C, 6) with respect to the tangents of ``T Exp(tangent)``, from gradients by rotations and translations."""
-    turned = rotations.mT @ by_rotations
-    skew = turned - turned.mT
-    by_rotation = torch.stack([skew[..., 2, 1], skew[..., 0, 2], skew[..., 1, 0]], dim=-1)
-    return torch.cat([(rotations.mT @ by_translations[..., None])[..., 0], by_rotation], dim=-1)
+        moved = acceleration.step(step.where(missing).flat(), residual.where(missing).flat())
+        adjoint, times_hessian = (
+            total.plus(total.like(part)) for total, part in zip((adjoint, times_hessian), moved, strict=True)
+        )
+    return adjoint
 
 
 def _where_nonzero(adjoint: Tangent, gradient: Tensor) -> Tensor:
     """A gradient (B, ...), exactly zero for sessions whose adjoint is zero: 0 times infinity may have made it NaN there."""
-    nonzero = torch.stack([part.flatten(1).any(1) for part in adjoint]).any(0)
-    return gradient.where(nonzero.view(-1, *[1] * (gradient.ndim - 1)), 0.0)
+    return gradient.where(adjoint.nonzero.view(-1, *[1] * (gradient.ndim - 1)), 0.0)
 
 
-def _for_all_cameras(state: State, step: Tangent) -> Tangent:
-    """A step for all C cameras and K lens and clock unknowns, with zeros for those that are held fixed."""
-    fixed_cameras = state.translations.shape[1] - step.cameras.shape[1]
-    fixed_unknowns = state.unknowns.shape[1] - step.unknowns.shape[1]
-    return step._replace(cameras=pad(step.cameras, (0, 0, fixed_cameras, 0)), unknowns=pad(step.unknowns, (0, fixed_unknowns)))
-
-
-def _with_data(objective: Objective, data: list[Tensor | None]) -> Objective:
-    """The same losses with other pixels, confidence, lengths, camera matrices, distortion and priors."""
+def _with_data(measurements: Measurements, data: Sequence[Tensor | None]) -> Measurements:
+    """The measurements with other pixels, confidence, lengths, camera matrices, distortion and priors."""
     pixels, confidence, lengths_m, matrix, distortion, prior_sigma = data
     assert pixels is not None
     assert confidence is not None
     assert lengths_m is not None
     assert matrix is not None
     assert prior_sigma is not None
-    m = objective.measurements
-    cameras = Intrinsics(matrix, distortion, m.cameras.fisheye)
-    unknowns = replace(m.unknowns, prior_sigma=prior_sigma)
-    measurements = replace(m, pixels=pixels, confidence=confidence, lengths_m=lengths_m, cameras=cameras, unknowns=unknowns)
-    return Objective(measurements, objective.losses)
+    cameras = Intrinsics(matrix, distortion, measurements.cameras.fisheye)
+    unknowns = replace(measurements.unknowns, prior_sigma=prior_sigma)
+    return replace(measurements, pixels=pixels, confidence=confidence, lengths_m=lengths_m, cameras=cameras, unknowns=unknowns)

@@ -1,45 +1,95 @@
-"""Newton iterations with the exact Hessian, to take a solver's result to the minimum up to rounding errors.
+"""Newton's method with the exact Hessian, to take a solver's result to the minimum up to rounding errors.
 
-Newton's method converges quadratically where Gauss-Newton converges only linearly.
+It converges quickly where Gauss-Newton converges only linearly. Where the noise that the objective reckons with depends on the
+state, both are brought to agree: the state is the minimum for the noise that is found there.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import torch
+from torch import Tensor
 
 from torchstickcal.model.objective import Objective
 from torchstickcal.model.state import State
-from torchstickcal.solvers.elimination.normal_equations import NormalEquations
+from torchstickcal.solvers.acceleration import Acceleration
+from torchstickcal.solvers.linearised import Linearised, Tangent, gradient_at
 
-_MAX_STEPS = 8
-_STEP_SIGMAS = 1e-9
-"""Length of a step, in standard deviations of the estimate, below which a session has converged."""
-_ROUNDING = 1e-12
-"""Relative increase of the cost that counts as rounding error."""
+_MAX_ROUNDS = 40
+_ROUNDING_SIGMAS, _NEAR_SIGMAS = 1e-7, 1e-3
+"""Length of a step, in standard deviations of the estimate, below which it is the last: for a minimum up to rounding errors, or
+near enough for everything but gradients, and as near as float32 allows."""
+_CONVERGED_SIGMAS = 1e-2
+"""The same, below which it has converged as far as rounding allows."""
+_SLOW, _OLD = 0.3, 3
+"""Ratio of the lengths of two steps, and number of steps with one Hessian, from which on it is built anew."""
 
 
 def polish(objective: Objective, state: State, cameras_free: bool) -> State:
-    """The minimum near a state, by Newton's method. A session in which no step lowers the cost keeps its state.
+    """The minimum near a state. A session in which the steps do not become shorter keeps its state.
 
     Args:
         objective: the objective to minimise. Its track losses must be quadratic.
         state: the result of a solver.
         cameras_free: whether all cameras but the first are unknowns too.
     """
-    best, cost = state, torch.full((objective.measurements.sessions,), torch.inf, dtype=torch.float64)
-    cost = cost.to(state.points.device)
-    trial = state
-    for _ in range(_MAX_STEPS):
-        system = NormalEquations(objective, trial, cameras_free, exact=True)
-        accepted = system.cost <= cost * (1 + _ROUNDING)
-        best, cost = best.replaced(accepted, trial), torch.minimum(system.cost, cost)
-        gradient = system.camera_gradient, system.unknown_gradient, system.point_gradient
-        *step, solved = system.solve(*gradient)
-        products = ((part * by).flatten(1).sum(1) for part, by in zip(gradient, step, strict=True))
-        squared_sigmas = sum(products, torch.zeros_like(cost))
-        moving = accepted & solved & (squared_sigmas > _STEP_SIGMAS**2)
+    return minimum_near(lambda _: objective, state, cameras_free)[0].state
+
+
+def minimum_near(
+    objective_at: Callable[[State], Objective], state: State, cameras_free: bool, to_rounding: bool = True
+) -> tuple[Linearised, Tensor]:
+    """The state near another that minimises the objective that belongs to it, and that objective there.
+
+    The Hessian is built once, and again only if the steps do not quickly become shorter: the way is short.
+
+    Args:
+        objective_at: the objective with the noise that is found at a state; otherwise as of :func:`polish`.
+        state: the result of a solver.
+        cameras_free: whether all cameras but the first are unknowns too.
+        to_rounding: whether to go on up to rounding errors.
+
+    Returns:
+        The objective at its minimum, and in which sessions that was found, (B,).
+    """
+    best = trial = state
+    at, acceleration = Linearised(objective_at(trial), trial, cameras_free), Acceleration()
+    objective, gradient, age, age_of_step, back = at.objective, at.gradient, 0, 0, False
+    is_double = objective.measurements.pixels.dtype == torch.float64
+    tolerance = _ROUNDING_SIGMAS if to_rounding and is_double else _NEAR_SIGMAS
+    shortest = torch.full_like(state.points[:, 0, 0], torch.inf)
+    moving = torch.ones_like(shortest, dtype=torch.bool)
+    for _ in range(_MAX_ROUNDS):
+        step = at.descent(gradient)
+        length = step.dot(gradient).clamp_min(0.0).sqrt()
+        shorter = length < shortest
+        slow = bool((moving & ~(length < _SLOW * shortest)).any())
+        if not back:
+            best = trial if bool((shorter | ~moving).all()) else best.replaced(moving & shorter, trial)
+            shortest = torch.where(moving & shorter, length, shortest)
+            ended = moving & (shortest <= tolerance)
+            best = best.replaced(ended, _moved(best, step, -1.0)) if bool(ended.any()) else best
+            moving &= ~ended & (shorter if age_of_step == 0 else True)
         if not bool(moving.any()):
             break
-        cameras, unknowns, points = step
-        trial = best.replaced(moving, best.retracted(-cameras, -points, -unknowns))
-    return best
+        # A step that has become longer is undone. It is tried again with a new Hessian, unless it had one.
+        back = not back and bool((moving & ~shorter).any())
+        if back:
+            trial, acceleration = best, Acceleration()
+        else:
+            moved, _ = acceleration.step(-step.where(moving).flat(), -gradient.where(moving).flat())
+            trial = best.replaced(moving, _moved(best, step.like(moved), 1.0))
+        objective, age_of_step = objective_at(trial), age
+        if back or (slow and age >= _OLD):
+            at, age = Linearised(objective, trial, cameras_free), 0
+            gradient = at.gradient
+        else:
+            gradient, age = gradient_at(objective, trial, cameras_free), age + 1
+    converged = shortest < _CONVERGED_SIGMAS
+    return Linearised(objective_at(best), best, cameras_free), converged
+
+
+def _moved(state: State, step: Tangent, factor: float) -> State:
+    """The state after so many times a step."""
+    return state.retracted(factor * step.cameras, factor * step.points, factor * step.unknowns)

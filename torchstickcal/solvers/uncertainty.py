@@ -113,9 +113,10 @@ def centre_covariances(centres: Tensor, covariance: Tensor) -> Tensor:
 def relative_scale_std(centres: Tensor, covariance: Tensor) -> Tensor:
     """Relative standard deviation of the scale of the rig, for camera centres (C, 3) and the covariance of the tangents.
 
-    The scale is the factor that best fits the camera centres to their true positions.
+    The scale is the factor that best fits the camera centres to their true positions, relative to the first one.
     """
-    jacobian = -(centres[1:, None] @ _point_jacobian(centres[1:])).flatten() / centres.square().sum()
+    arms = centres[1:] - centres[0]
+    jacobian = -(arms[:, None] @ _point_jacobian(centres[1:])).flatten() / arms.square().sum()
     return (jacobian @ covariance @ jacobian).clamp_min(0.0).sqrt()
 
 

@@ -195,6 +195,7 @@ class NormalEquations:
         Returns:
             The solution in the same three parts, and whether the Hessian is positive definite (B,).
         """
+        point_rhs = point_rhs.to(self.point_hessian.dtype)
         reduced_rhs = torch.cat([camera_rhs.flatten(1), unknown_rhs], dim=1)
         for part, eliminated in self._eliminated_parts() if self._free_cameras else ():
             rows, solved = eliminated.forward_solve_cross(self._points(part.columns), point_rhs[..., part.columns])
@@ -371,6 +372,8 @@ class NormalEquations:
 
     def _eliminated_parts(self) -> Iterator[tuple[Part, _EliminatedPart]]:
         """All parts, eliminated: from the cache, or computed again."""
+        if not self._cache and not self._free_cameras:
+            self._cache = [self._eliminate(part) for part in self._parts]
         for index, part in enumerate(self._parts):
             yield part, self._cache[index] if self._cache else self._eliminate(part)
 

@@ -1,0 +1,54 @@
+"""The command `triangulate`."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from dataclasses import replace
+from typing import Any
+
+from torchstickcal.cli.calibrate import given_of
+from torchstickcal.cli.outputs import EXIT_DONE, check_frame_rate, point_writers, write_json
+
+_REPORT = "report.json"
+
+
+def triangulate_session(options: argparse.Namespace) -> int:
+    from torchstickcal.config import load_config
+    from torchstickcal.files import atomic_set, try_writing
+    from torchstickcal.io import Motion, Rig, load_session
+    from torchstickcal.io.results import read_result
+    from torchstickcal.pipeline.triangulate import triangulate
+    from torchstickcal.show.reconstruction import summary, table
+
+    config = load_config(options.config)
+    config = replace(config, synchronise=False) if options.no_sync else config
+    writers = point_writers(options.write)
+    try_writing(options.out, [*writers, _REPORT])
+    calibration = read_result(options.calibration)
+    if isinstance(calibration, Rig):
+        calibration = calibration.in_metres(options.units if calibration.unit is None else None)
+    rig = calibration if isinstance(calibration, Rig) else Rig.of_calibration(calibration)
+    given = given_of(options)
+    given = replace(given, intrinsics=rig, stick=given.stick or [])
+    session = load_session(options.session, options.format, given)
+    for note in session.notes:
+        print(f"note: {note}", file=sys.stderr)
+    check_frame_rate(writers, session.observations)
+    found = triangulate(session.observations, calibration, config, turned=options.turned)
+    with atomic_set(options.out) as folder:
+        for name, writer in writers.items():
+            writer.write(folder / name, Motion.of(found))
+        write_json(folder / _REPORT, _provenance(options, list(session.notes)) | summary(found))
+    print(table(found))
+    print(f"\n{', '.join([*writers, _REPORT])} in {options.out}")
+    return EXIT_DONE
+
+
+def _provenance(options: argparse.Namespace, notes: list[str]) -> dict[str, Any]:
+    return {
+        "session": ", ".join(map(str, options.session)),
+        "calibration": str(options.calibration),
+        "config": options.config,
+        **({"notes": notes} if notes else {}),
+    }

@@ -1,0 +1,249 @@
+"""How large the errors are that a stage reckons with, and its losses with them.
+
+Both depend on the state at which the errors are looked at. What is decided on the way, which keypoints take part and which
+correlations are real, is held as a :class:`NoiseGates`, so that the rest is a smooth function of state and measurements.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from torchstickcal.config import Config, Stage
+from torchstickcal.errors import ConfigError
+from torchstickcal.losses import Loss, LossContext, LossSettings, TrackLoss
+from torchstickcal.model.correlation import CorrelationGates, error_correlation
+from torchstickcal.model.measurements import Measurements
+from torchstickcal.model.noise import estimate_acceleration_m, sigma_px_of
+from torchstickcal.model.objective import Objective
+from torchstickcal.model.state import State
+from torchstickcal.solvers.elimination.normal_equations import NormalEquations
+from torchstickcal.solvers.linearised import Linearised
+from torchstickcal.solvers.newton import minimum_near
+
+_ESTIMATED, _SIGMA_PX = "estimated", "sigma_px"
+_CONTRAST = 1.0
+"""Variance between points, of the logarithm of the errors that last, in their weights. A stick's ends are often tracked better
+than joints, which are many: seen as one group, they would look like them."""
+
+
+class NoiseLevels(NamedTuple):
+    """How large the errors are, for each point."""
+
+    sigma_px: Tensor
+    """(B, P), estimated standard deviation of the keypoints along an image axis, pixels"""
+    correlation_frames: Tensor
+    """(B, P), as many keypoints count as one, because their errors are alike"""
+    acceleration_m: Tensor
+    """(B, P), standard deviation of the second difference over frames, metres; infinite where no loss needs it"""
+
+    def replaced(self, where: Tensor, other: NoiseLevels) -> NoiseLevels:
+        """The levels with some sessions (B,), True where, taken from another."""
+        return NoiseLevels(*(torch.where(where[:, None], new, old) for old, new in zip(self, other, strict=True)))
+
+
+@dataclass(frozen=True)
+class Chosen:
+    """Keypoints from which their noise is estimated.
+
+    Args:
+        mask: (B, C, N).
+        cut: residual, in standard deviations, up to which they were chosen.
+    """
+
+    mask: Tensor
+    cut: float
+
+    def sigma_px(self, given: Measurements, squared_residuals: Tensor) -> Tensor:
+        """The standard deviation of the keypoints, (B, P), pixels; arguments as of :func:`sigma_px_of`."""
+        return sigma_px_of(given, squared_residuals, self.mask, self.cut)
+
+
+@dataclass(frozen=True)
+class NoiseGates:
+    """What was decided when the noise was estimated."""
+
+    chosen: Chosen
+    """the keypoints from which the noise is estimated"""
+    correlation: CorrelationGates | None
+    """None where no loss asks for how long errors last"""
+
+    def replaced(self, where: Tensor, other: NoiseGates) -> NoiseGates:
+        """The decisions with some sessions (B,), True where, taken from another."""
+        mine, theirs = self.correlation, other.correlation
+        correlation = None if mine is None or theirs is None else mine.replaced(where, theirs)
+        mask = torch.where(where[:, None, None], other.chosen.mask, self.chosen.mask)
+        return NoiseGates(Chosen(mask, other.chosen.cut), correlation)
+
+
+@dataclass(frozen=True)
+class StageNoise:
+    """The noise that a stage of a configuration reckons with.
+
+    Args:
+        stage: the stage.
+        given_sigma_px: standard deviation of the keypoints along an image axis, (P,) or (), pixels; None to estimate it.
+    """
+
+    stage: Stage
+    given_sigma_px: Tensor | None
+
+    @property
+    def estimated(self) -> bool:
+        """Whether a loss of the stage takes something from the data."""
+        wanted = [name for loss in self.stage.losses.values() for name, value in vars(loss).items() if value == _ESTIMATED]
+        return any(name != _SIGMA_PX or self.given_sigma_px is None for name in wanted)
+
+    def chosen(self, kept: Measurements, near: Callable[[], Chosen]) -> Chosen:
+        """From which keypoints the noise is estimated once no more are rejected: those that take part in the stage.
+
+        While it is not yet known which keypoints are wrong, a narrow cut keeps them from raising the estimate. Afterwards a
+        wide one is better: a keypoint that crosses the cut is a jump, and few keypoints are near a wide one.
+
+        Args:
+            kept: the keypoints that take part in the stage.
+            near: gives those that a narrow cut leaves.
+        """
+        rejects = self.stage.reject_sigmas
+        return near() if rejects is None else Chosen(kept.visible, rejects)
+
+    def decided(
+        self, kept: Measurements, state: State, squared_residuals: Tensor, chosen: Chosen
+    ) -> tuple[dict[str, Loss], NoiseLevels, NoiseGates]:
+        """The stage's losses at a state, their noise, and what was decided about it.
+
+        Args:
+            kept: the keypoints that take part in the stage.
+            state: where the errors are looked at.
+            squared_residuals: of all keypoints at the state.
+            chosen: the keypoints from which their noise is estimated.
+        """
+        found = _Levels(kept, state, chosen.sigma_px(kept, squared_residuals))
+        losses = self._losses(kept, found.sigma_px, found.correlation_frames, found.acceleration_m)
+        return losses, found.levels, NoiseGates(chosen, found.gates)
+
+    def levels(self, given: Measurements, kept: Measurements, state: State, gates: NoiseGates) -> NoiseLevels:
+        """The noise at a state with all decisions held; differentiable by state and measurements.
+
+        Args:
+            given: all keypoints.
+            kept: those that take part in the stage.
+            state: where the errors are looked at.
+            gates: what was decided.
+        """
+        sigma_px = gates.chosen.sigma_px(given, given.squared_residuals(state))
+        found = _Levels(kept, state, sigma_px, gates)
+        self._losses(kept, found.sigma_px, found.correlation_frames, found.acceleration_m)
+        return found.levels
+
+    def losses(self, kept: Measurements, levels: NoiseLevels) -> dict[str, Loss]:
+        """The stage's losses with some noise; differentiable by it."""
+
+        def correlation_frames(given: float | str) -> Tensor:
+            return (
+                levels.correlation_frames if given == _ESTIMATED else torch.full_like(levels.correlation_frames, float(given))
+            )
+
+        return self._losses(kept, levels.sigma_px, correlation_frames, lambda _: levels.acceleration_m)
+
+    def _losses(
+        self,
+        kept: Measurements,
+        sigma_px: Tensor,
+        correlation_frames: Callable[[float | str], Tensor],
+        acceleration_m: Callable[[dict[str, Loss]], Tensor],
+    ) -> dict[str, Loss]:
+        """The losses. Track losses come last: their sigma may be estimated with the others at hand."""
+        losses: dict[str, Loss] = {}
+        used_px = sigma_px if self.given_sigma_px is None else self.given_sigma_px.to(sigma_px).expand_as(sigma_px)
+        context = LossContext(kept.point_index, kept.stick_sigma_m, used_px, correlation_frames, lambda: acceleration_m(losses))
+        for name, settings in sorted(self.stage.losses.items(), key=_is_track):
+            losses[name] = settings.build(context)
+        return losses
+
+
+@dataclass(frozen=True)
+class HeldNoise:
+    """The noise of a stage and its objective as functions of state and measurements, with all decisions held.
+
+    Args:
+        noise: of the stage.
+        gates: what was decided about it.
+        inliers: (B, C, N), the keypoints that take part in the stage.
+    """
+
+    noise: StageNoise
+    gates: NoiseGates
+    inliers: Tensor
+
+    def levels(self, measurements: Measurements, state: State) -> NoiseLevels:
+        """The levels at a state."""
+        return self.noise.levels(measurements, self._kept(measurements), state, self.gates)
+
+    def objective(self, measurements: Measurements, levels: Sequence[Tensor]) -> Objective:
+        """The stage's objective with some levels."""
+        kept = self._kept(measurements)
+        return Objective(kept, self.noise.losses(kept, NoiseLevels(*levels)))
+
+    def minimum_near(self, measurements: Measurements, state: State, to_rounding: bool = True) -> tuple[Linearised, Tensor]:
+        """The minimum whose own noise the objective reckons with, near a state, and in which sessions it was found, (B,)."""
+
+        def objective_at(state: State) -> Objective:
+            return self.objective(measurements, self.levels(measurements, state))
+
+        return minimum_near(objective_at, state, cameras_free=True, to_rounding=to_rounding)
+
+    def _kept(self, measurements: Measurements) -> Measurements:
+        return replace(measurements, confidence=measurements.confidence.where(self.inliers, 0.0))
+
+
+class _Levels:
+    """Estimates the levels that losses ask for while they are built, each at most once."""
+
+    def __init__(self, kept: Measurements, state: State, sigma_px: Tensor, held: NoiseGates | None = None) -> None:
+        self._kept, self._state, self._held = kept, state, held
+        self.sigma_px = sigma_px
+        self.levels = NoiseLevels(sigma_px, torch.ones_like(sigma_px), torch.full_like(sigma_px, torch.inf))
+        self.gates: CorrelationGates | None = None
+
+    def correlation_frames(self, given: float | str) -> Tensor:
+        times = torch.full_like(self.sigma_px, 1.0 if given == _ESTIMATED else float(given))
+        if given == _ESTIMATED:
+            gates = None if self._held is None else self._held.correlation
+            found = error_correlation(self._kept, self._state, self.sigma_px, _CONTRAST, gates)
+            times, self.gates = found.times, found.gates
+        self.levels = self.levels._replace(correlation_frames=times)
+        return times
+
+    def acceleration_m(self, losses: dict[str, Loss]) -> Tensor:
+        objective = Objective(self._kept, losses)
+        if self._held is None:
+            variance = NormalEquations(objective, self._state, cameras_free=False).point_variance()
+        else:
+            variance = objective.point_variance(self._state)
+        self.levels = self.levels._replace(acceleration_m=estimate_acceleration_m(self._kept, self._state.points, variance))
+        return self.levels.acceleration_m
+
+
+def check_noise(config: Config, points: int) -> None:
+    """Refuse given noise of another number of points than a session has.
+
+    Raises:
+        ConfigError: if it is.
+    """
+    given = config.given_sigma_px
+    if given is not None and given.ndim and len(given) != points:
+        raise ConfigError(
+            "the given noise is of another number of points",
+            where="config.sigma_px",
+            got=f"{len(given)} numbers",
+            expected=f"one number, or {points}: one for each point",
+        )
+
+
+def _is_track(named: tuple[str, LossSettings]) -> bool:
+    return issubclass(named[1].loss, TrackLoss)

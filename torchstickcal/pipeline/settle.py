@@ -1,0 +1,67 @@
+"""Stages taken to their minima up to rounding errors, and cameras and noise that agree."""
+
+from __future__ import annotations
+
+import time
+
+import torch
+from torch import Tensor
+
+from torchstickcal.model.measurements import Measurements
+from torchstickcal.model.noise import NEAR_SIGMAS, near_keypoints
+from torchstickcal.model.objective import Objective
+from torchstickcal.pipeline.noise import Chosen, HeldNoise
+from torchstickcal.pipeline.run import Run
+from torchstickcal.pipeline.scale import rulers, scale_factors
+from torchstickcal.pipeline.stage import StageResult
+from torchstickcal.solvers.linearised import Linearised
+from torchstickcal.solvers.newton import minimum_near
+
+
+@torch.no_grad()
+def settled(name: str, measurements: Measurements, result: StageResult, run: Run) -> tuple[StageResult, Tensor]:
+    """A stage that estimated cameras, with the noise as it is found where the stage ends.
+
+    A stage reckons with the noise that was found where it began. That is a little different from the noise where it ends. Here
+    both are brought to agree, with the keypoints that take part and all other decisions held.
+
+    Args:
+        name: of the stage.
+        measurements: the sessions.
+        result: where the stage has ended, or nearly.
+        run: what all steps share.
+
+    Returns:
+        The result, and in which sessions it was found, (B,). Others may be anywhere on the way.
+    """
+    began, noise, at = time.perf_counter(), run.noise_of(result.stage), result.minimum
+    kept, squared = measurements.keeping(result.inliers), measurements.squared_residuals(at)
+
+    def near() -> Chosen:
+        return Chosen(near_keypoints(measurements, squared), NEAR_SIGMAS)
+
+    *_, gates = noise.decided(kept, at, squared, noise.chosen(kept, near))
+    held = HeldNoise(noise, gates, result.inliers)
+    found, converged = held.minimum_near(measurements, at, run.to_rounding)
+    levels = held.levels(measurements, found.state)
+    run.took(name, time.perf_counter() - began)
+    return _with_minimum(result, found, run)._replace(noise=levels, gates=gates), converged
+
+
+@torch.no_grad()
+def polished(name: str, measurements: Measurements, result: StageResult, run: Run) -> tuple[StageResult, Tensor]:
+    """A stage at its minimum, with the noise that it began with; otherwise as :func:`settled`."""
+    began, free = time.perf_counter(), result.stage.cameras == "free"
+    objective = Objective(measurements.keeping(result.inliers), result.losses)
+    found, converged = minimum_near(lambda _: objective, result.minimum, free)
+    run.took(name, time.perf_counter() - began)
+    return _with_minimum(result, found, run), converged
+
+
+def _with_minimum(result: StageResult, found: Linearised, run: Run) -> StageResult:
+    """The result with another minimum, brought to scale where the stage does so."""
+    state, m = found.state, found.objective.measurements
+    if result.stage.rescale:
+        factors, _ = scale_factors(m, state.points, rulers(m, run.config))
+        state = state.scaled(factors)
+    return result._replace(state=state, minimum=found.state, losses=found.objective.losses)
