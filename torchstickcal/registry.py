@@ -10,6 +10,7 @@ import difflib
 import importlib
 import pkgutil
 import sys
+import threading
 from collections.abc import Iterable, Iterator, Mapping
 from typing import Any, TypeVar
 
@@ -41,6 +42,8 @@ class Registry(Mapping[str, _Thing]):
         self._folder = folder
         self._things: dict[str, _Thing] = {}
         self._imported = False
+        self._importing: set[int] = set()
+        """threads that import the folder's modules; another one waits for each module until it is complete, as Python has it"""
 
     def register(self, name: str, thing: _Thing, *, replace: bool = False) -> _Thing:
         """Add a thing under a name; returns the thing.
@@ -111,19 +114,19 @@ class Registry(Mapping[str, _Thing]):
 
     def _import_shipped(self) -> None:
         """Import the folder's modules, in the order of their names; they register what they define."""
-        if self._imported:
+        thread = threading.get_ident()
+        if self._imported or thread in self._importing:
             return
-        self._imported = True
+        self._importing.add(thread)
         outermost = self._folder not in _being_imported
         _being_imported.add(self._folder)
         try:
             package = importlib.import_module(self._folder)
             for name in sorted(module.name for module in pkgutil.iter_modules(package.__path__)):
                 importlib.import_module(f"{self._folder}.{name}")
-        except BaseException:
-            self._imported = False
-            raise
+            self._imported = True
         finally:
+            self._importing.discard(thread)
             if outermost:
                 _being_imported.discard(self._folder)
 

@@ -16,11 +16,10 @@ from typing import TYPE_CHECKING, Any
 from torchstickcal.cli.calibrate import given_of, refining, with_stick
 from torchstickcal.cli.outputs import EXIT_DONE, EXIT_NOT_CONVERGED, chosen_writers, write_results
 from torchstickcal.cli.plugins import import_plugins
-from torchstickcal.cli.world import World, placed, world_of
+from torchstickcal.cli.world import placed, world_of
 from torchstickcal.errors import CalibrationError
 
 if TYPE_CHECKING:
-    from torchstickcal.io import Writer
     from torchstickcal.many import SessionRow
     from torchstickcal.observations import Observations
     from torchstickcal.result import Calibration
@@ -39,10 +38,13 @@ def calibrate_sessions(options: argparse.Namespace) -> int:
 
     config, refine = refining(load_config(options.config), options.refine, options.no_sync)
     memory_bytes, shard = _bytes(options.memory), _shard(options.shard)
-    writers, world = chosen_writers(options.write), world_of(options.world, options.units)
+    writing = _Writing(options.config, options.write, _with_whole_path(options.world), options.units)
+    writing.check()
     given = given_of(options)
-    if isinstance(given.intrinsics, str | Path):
-        given = replace(given, intrinsics=Path(given.intrinsics).absolute())
+    for name in ("intrinsics", "skeleton"):  # files, which processes elsewhere must find too
+        file = getattr(given, name)
+        if isinstance(file, str | Path) and Path(file).is_file():
+            given = replace(given, **{name: type(file)(Path(file).absolute())})
     stick = _Stick(options.stick_length, options.stick_sigma)
     sessions = session_files(options.sessions, options.format, given, None if stick == _Stick() else stick)
     plugins = [str(Path(plugin).absolute()) if plugin.endswith(".py") else plugin for plugin in options.plugin]
@@ -57,7 +59,7 @@ def calibrate_sessions(options: argparse.Namespace) -> int:
             memory_bytes=memory_bytes,
             shard=shard,
             retry=options.retry,
-            write=partial(_write, writers, world, {"config": options.config}),
+            write=writing,
             prepare=partial(import_plugins, plugins),
             progress=_Progress(),
         )
@@ -82,19 +84,36 @@ class _Stick:
         return with_stick(observations, self.length_m, self.sigma_m)
 
 
-def _write(
-    writers: dict[str, Writer],
-    world: World,
-    more: dict[str, Any],
-    calibration: Calibration,
-    folder: Path,
-    provenance: dict[str, Any],
-) -> None:
-    """Write the files that `calibrate` writes."""
-    calibration, sentences = placed(calibration, world)
-    if notes := [*provenance.get("notes", []), *sentences]:
-        more = more | {"notes": notes}
-    write_results(calibration, folder, writers, provenance | more)
+@dataclass(frozen=True)
+class _Writing:
+    """Writes the files that `calibrate` writes with the same options."""
+
+    config: str
+    write: str | None
+    world: str
+    units: str | None
+
+    def check(self) -> None:
+        """Refuse options that cannot be followed, before anything is calculated.
+
+        Raises:
+            CalibrationError: if there are any.
+        """
+        chosen_writers(self.write)
+        world_of(self.world, self.units)
+
+    def __call__(self, calibration: Calibration, folder: Path, provenance: dict[str, Any]) -> None:
+        calibration, sentences = placed(calibration, world_of(self.world, self.units))
+        provenance = provenance | {"config": self.config}
+        if notes := [*provenance.get("notes", ()), *sentences]:
+            provenance["notes"] = notes
+        write_results(calibration, folder, chosen_writers(self.write), provenance)
+
+
+def _with_whole_path(world: str) -> str:
+    """A frame of the world whose file is found from any folder."""
+    kind, _, file = world.partition(" ")
+    return f"{kind} {Path(file).absolute()}" if file else kind
 
 
 def _bytes(text: str | None) -> int | None:

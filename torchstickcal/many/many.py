@@ -90,7 +90,8 @@ def calibrate_many(
         shard: ``(i, n)``, from ``(1, n)`` to ``(n, n)``, for every n-th session only: the rest is done by other calls with the
             same sessions in the same order, on other machines.
         retry: whether sessions that failed are tried again.
-        write: writes the files of a session into a folder.
+        write: called with a calibration, a folder, and a dictionary that says of what session it is; writes the files. Where it
+            has options, it is a dataclass: its ``repr`` tells one choice of them from another.
         prepare: called first where a session is calibrated: it imports the modules that register losses, camera unknowns or
             file formats of your own, for example ``functools.partial(importlib.import_module, "my_losses")``.
         progress: called after each session.

@@ -8,7 +8,7 @@ import re
 import time
 from collections.abc import Callable
 from contextlib import nullcontext
-from dataclasses import dataclass
+from dataclasses import dataclass, is_dataclass
 from pathlib import Path
 from typing import Any
 
@@ -53,7 +53,8 @@ class Settings:
 
     def code_of(self, source: Source) -> str:
         """A short code that is the same for the same configuration and options."""
-        return hashlib.sha256(repr((self.config, self.refine, source.options)).encode()).hexdigest()[:12]
+        write = repr(self.write) if is_dataclass(self.write) else getattr(self.write, "__qualname__", type(self.write).__name__)
+        return hashlib.sha256(repr((self.config, self.refine, write, source.options)).encode()).hexdigest()[:12]
 
 
 @dataclass(frozen=True)
@@ -124,7 +125,7 @@ def folder_of(name: str) -> str:
 
     Example:
         >>> folder_of("swing 1.npz"), folder_of("day 2/swing.npz")
-        ('swing 1.npz', 'day 2_swing.npz-a86e6b7a')
+        ('swing 1.npz', 'day 2_swing.npz-ecca6757')
     """
     plain = re.sub(r"[^\w .+=@-]", "_", name)[:_LONGEST_FOLDER].strip(" .")
     if plain == name:
