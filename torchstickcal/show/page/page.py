@@ -76,7 +76,7 @@ def report_page(calibration: Calibration, provenance: Mapping[str, Any] | None =
             _head(calibration, title),
             _quality(calibration.quality),
             _tiles(calibration, cameras),
-            _scene(data),
+            _scene(calibration, data),
             _cameras(calibration, data, cameras),
             "</div>",
             _curves(calibration, data),
@@ -233,7 +233,7 @@ def _median(values: Sequence[float]) -> float:
     return statistics.median(known) if known else math.nan
 
 
-def _scene(data: Mapping[str, Any]) -> str:
+def _scene(calibration: Calibration, data: Mapping[str, Any]) -> str:
     """The scene in space. The section stays open: the slider is also that of the images."""
     views = "".join(
         f'<option value="{number}">{escape(printable(one["name"]))}</option>' for number, one in enumerate(data["cameras"])
@@ -258,7 +258,7 @@ def _scene(data: Mapping[str, Any]) -> str:
             ("ring relabelled", "a label was corrected"),
             ("fill used", "ellipsoid that holds 95 %, magnified"),
         )
-        + "<p class='small'>Metres, in the axes of the calibration. Drag to turn, with two fingers to zoom and tilt."
+        + f"<p class='small'>{escape(calibration.world.description)} Metres. Drag to turn, with two fingers to zoom and tilt."
         f"{thinned}{left_out}</p></section>"
     )
 
