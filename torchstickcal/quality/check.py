@@ -15,6 +15,7 @@ from torch import Tensor
 from torchstickcal.config import InitialiseSettings
 from torchstickcal.errors import ObservationError
 from torchstickcal.geometry import se3
+from torchstickcal.geometry.singular import covariance_root
 from torchstickcal.metrics import rotation_angle
 from torchstickcal.model.measurements import Measurements
 from torchstickcal.model.noise import estimate_sigma_px
@@ -287,9 +288,7 @@ def _lengths(rig: _Rig, observations: Observations) -> list[Finding]:
 
 def _lasting(pull: Tensor, own: Tensor) -> float:
     """Variance of the sum of pulls (K, 6), over that of independent keypoints, at least 1."""
-    mean = own.mean(0)
-    root = torch.linalg.cholesky(mean + 1e-9 * mean.diagonal().mean().clamp_min(1e-300) * torch.eye(6).to(mean))
-    white = torch.linalg.solve_triangular(root, pull.mT, upper=False).mT
+    white = pull @ covariance_root(own.mean(0))
     found = [1.0]
     for blocks in (12, 24, len(white)):
         length = max(1, len(white) // blocks)

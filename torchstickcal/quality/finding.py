@@ -61,6 +61,10 @@ class Finding:
     unit: str = ""
     is_cause: bool = False
 
+    def __post_init__(self) -> None:
+        for name in ("figure", "limit"):
+            object.__setattr__(self, name, _finite(getattr(self, name)))
+
     @property
     def text(self) -> str:
         """Meaning and advice as one text."""
@@ -103,4 +107,4 @@ class Finding:
 
 def _finite(value: float | None) -> float | None:
     """JSON has no NaN and no infinity."""
-    return value if value is not None and math.isfinite(value) else None
+    return float(value) if value is not None and math.isfinite(value) else None

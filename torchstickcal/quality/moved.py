@@ -14,6 +14,7 @@ import torch
 from torch import Tensor
 
 from torchstickcal.geometry import se3
+from torchstickcal.geometry.singular import covariance_of, covariance_root
 from torchstickcal.quality.linear import FramePulls
 
 LEAST_EVIDENCE = 32.0
@@ -61,7 +62,7 @@ def motion_of(pulls: FramePulls, rotations: Tensor, translations: Tensor) -> Mot
     cameras = gradient.shape[1]
     prior = gradient.new_tensor([1 / _PRIOR_M**2] * 3 + [1 / _PRIOR_RAD**2] * 3).diag()
     total = information.sum(0) + torch.block_diag(*[1e-2 * prior] * cameras)
-    inverse = torch.linalg.inv(total)
+    inverse = covariance_of(total)
     common = inverse @ gradient.sum(0).flatten()
     gradient = gradient - (information @ common).unflatten(1, (cameras, 6))
     edge = max(2, round(_EDGE * pulls.parts))
@@ -128,8 +129,7 @@ def _explained(own: Tensor, share: Tensor, change: Tensor) -> Tensor:
 
 def _variance(pull: Tensor, own: Tensor) -> float:
     """Variance of sums of pulls (K, 6), over that of independent keypoints with the noise that they were found to have."""
-    root = torch.linalg.cholesky(own.mean(0) + 1e-9 * own.mean(0).diagonal().mean().clamp_min(1e-300) * torch.eye(6).to(own))
-    white = torch.linalg.solve_triangular(root, pull.mT, upper=False).mT
+    white = pull @ covariance_root(own.mean(0))
     found = []
     for length in {1, max(1, len(white) // (4 * _BLOCKS)), max(1, len(white) // (2 * _BLOCKS)), max(1, len(white) // _BLOCKS)}:
         blocks = white[: len(white) // length * length].unflatten(0, (-1, length)).sum(1) / length**0.5
