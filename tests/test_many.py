@@ -19,14 +19,15 @@ from typing import Any
 import pytest
 import torch
 
-from torchstickcal import CalibrationError, FileFormatError, Observations, calibrate, calibrate_many
+from torchstickcal import CalibrationError, FileFormatError, Observations, Stick, calibrate, calibrate_many, load_config
 from torchstickcal.cli import main
-from torchstickcal.io import write_npz
+from torchstickcal.cli.calibrate_many import _Writing
+from torchstickcal.io import Given, write_npz
 from torchstickcal.many import SessionFile, SessionRow, read_manifests, session_files
 from torchstickcal.many.manifest import open_manifest
 from torchstickcal.many.memory import Budget, needed_bytes
-from torchstickcal.many.sources import sources_of
-from torchstickcal.many.task import folder_of
+from torchstickcal.many.sources import Source, sources_of
+from torchstickcal.many.task import Settings, folder_of
 from torchstickcal.processes import SPAWN
 from torchstickcal.simulate import Noise, golf_session
 
@@ -247,6 +248,17 @@ def test_other_settings_need_another_folder(expected: tuple[Path, Any]):
     for more in ({"config": "stick_only"}, {"refine": ["focal"]}):
         with pytest.raises(CalibrationError, match="other settings"):
             calibrate_many(SWINGS, out=expected[0], jobs=1, **more)
+
+
+def test_the_code_of_the_settings_tells_what_changes_the_files():
+    def code(config: Any = "default", refine: Any = None, path: str = "a.npz", stick: Any = None, **writing: Any) -> str:
+        write = _Writing(**{"config": "x", "export": None, "write": None, "world": "camera", "units": None} | writing)
+        source = Source("a", SessionFile(path, given=None if stick is None else Given(Stick(0, 1, stick))))
+        return Settings(load_config(config), refine, None, write, None).code_of(source)
+
+    others = [code("stick_only"), code(refine="auto"), code(stick=1.0), code(stick=1.1), code(world="floor"), code(write="trc")]
+    assert len({code(), *others}) == 7
+    assert code(path="b.npz") == code() == code({"extends": "default"})
 
 
 # --- shards, memory, names ---------------------------------------------------------------------------------------------------
