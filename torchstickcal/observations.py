@@ -19,6 +19,8 @@ from torchstickcal.stick import Stick, check_ends, located_sticks, point_index
 LEAST_CONFIDENCE = 1e-4
 """Confidence, as a share of the session's largest, up to which a keypoint counts as not seen. Where nothing else determines a
 point, such keypoints would: with errors and gradients that are larger the smaller the confidence is."""
+_NO_CONFIDENCE = 1e-12
+"""Confidence up to which a keypoint counts as not seen in any case: smaller numbers overflow when they are inverted."""
 _COEFFICIENTS = (4, 5, 8, 12, 14)
 _FISHEYE_COEFFICIENTS = (4,)
 _LARGEST_INTRINSIC = 1e9
@@ -133,7 +135,7 @@ class Observations:
         visible = self.keypoints.isfinite().all(-1)
         if self.confidence is not None:
             largest = self.confidence.where(visible, 0.0).max()
-            visible = visible & (self.confidence > LEAST_CONFIDENCE * largest)
+            visible = visible & (self.confidence > (LEAST_CONFIDENCE * largest).clamp_min(_NO_CONFIDENCE))
         put(self, "visible", visible)
         put(self, "sticks", located_sticks(sticks, self.point_names))
         self._check_sticks()

@@ -77,6 +77,25 @@ VALUES: dict[str, list[str] | None] = {
     "--skeleton": ["coco_17", "config.toml", "broken.toml", "missing.toml", "x", "", "folder"],
     "--person": ["largest", "stick", "0", "-1", "99", "x", ""],
     "--units": ["m", "mm", "x", ""],
+    "--write": ["pose2sim", "trc", "cameras.json", "x", ",", ""],
+    "--world": ["camera", "athlete", "floor", "points x", "calibration calibration.toml", "x", ""],
+    "--initial": ["calibration.toml", *_PATHS],
+    "--calibration": ["calibration.toml", *_PATHS],
+    "--turned": ["left", "x", ""],
+    "--split-moved": None,
+    "--strict": None,
+    "--verbose": None,
+    "--to": ["anipose", "trc", "x", ""],
+    "--sport": ["golf", "x", ""],
+    "--up": ["0 0 1", "0 0 0", "nan 0 1", "x y z"],
+    "--from": ["pose2sim", "x", ""],
+    "--tape": ["red,yellow", "x", ","],
+    "--weights": _PATHS,
+    "--rtmlib": ["x", ""],
+    "--cluster": ["x", ""],
+    "--shard": ["1/2", "3/2", "x", ""],
+    "--memory": ["8GB", "1", "x", ""],
+    "--retry": None,
 }
 """The values that are tried of each option, words separated by blanks; None for an option without one. What would take long is
 left out."""
@@ -87,17 +106,34 @@ COMMANDS = {
     "simulate": (["wand", "golf", "x", "", "hard"],),
     "benchmark": (["folder", "session.npz", "x", ".", "missing", ""],),
     "list": (["losses", "formats", "x", ""],),
+    "check": (["calibration.toml"] * len(_PATHS) + _PATHS, ["session.npz"] * len(_PATHS) + _PATHS),
+    "triangulate": (["session.npz"] * len(_PATHS) + _PATHS,),
+    "info": (["session.npz"] * len(_PATHS) + _PATHS,),
+    "convert": (["calibration.toml"] * len(_PATHS) + _PATHS, ["cameras.json", "points.trc", *_OUT]),
+    "sample": (_OUT,),
+    "report": (_PATHS,),
+    "analyse": (_PATHS,),
+    "detect": (_PATHS,),
 }
 """The values that are tried of each argument of each command."""
 FITTING = {
     "calibrate": [
         *("--format", "--export", "--config", "--refine", "--no-sync", "--stick-length", "--stick-sigma", "--plugin"),
         *("--stick", "--stick-points", "--intrinsics", "--image-size", "--fps", "--skeleton", "--person"),
+        *("--write", "--world", "--initial", "--turned", "--split-moved", "--strict", "--verbose"),
     ],
     "evaluate": ["--format", "--json", "--plugin", "--units"],
     "simulate": ["--seed", "--plugin"],
     "benchmark": ["--json", "--config", "--plugin", "--count"],
     "list": ["--plugin"],
+    "check": ["--json", "--units", "--strict", "--format"],
+    "triangulate": ["--write", "--fps", "--units"],
+    "info": ["--json"],
+    "convert": ["--to", "--from", "--units"],
+    "sample": [],
+    "report": [],
+    "analyse": ["--sport", "--up", "--fps"],
+    "detect": ["--tape", "--weights", "--rtmlib"],
 }
 """The options that a command takes, apart from those that it needs."""
 
@@ -105,18 +141,20 @@ FITTING = {
 @st.composite
 def command_lines(draw: st.DrawFn) -> list[str]:
     """A command, mostly with what it needs, and some options."""
-    command = draw(st.sampled_from(["calibrate"] * 4 + ["evaluate"] * 2 + [*COMMANDS]))
+    command = draw(st.sampled_from(["calibrate"] * 12 + ["evaluate"] * 4 + [*COMMANDS]))
     words = [command, *(draw(st.sampled_from(values)) for values in COMMANDS[command])]
     if command == "simulate":
         words += ["--count", draw(st.sampled_from(VALUES["--count"] or []))]
-    if command in ("calibrate", "simulate"):
+    if command == "triangulate":
+        words += ["--calibration", draw(st.sampled_from(VALUES["--calibration"] or []))]
+    if command in ("calibrate", "simulate", "triangulate", "detect"):
         words += ["--out", draw(st.sampled_from(["out"] * 6 + _OUT))]
-    options = draw(st.lists(st.sampled_from(FITTING[command]), max_size=2, unique=True))
+    options = draw(st.lists(st.sampled_from(FITTING[command]), max_size=2, unique=True)) if FITTING[command] else []
     if draw(st.integers(0, 9)) == 9:
         options.append(draw(st.sampled_from(list(VALUES))))
     for option in options:
         values = VALUES[option]
         value = draw(st.one_of(st.just(values[0]), st.sampled_from(values))) if values else ""
-        several = option in ("--stick", "--image-size")
+        several = option in ("--stick", "--image-size", "--up", "--world")
         words += [option] if values is None else [option, *(value.split() if several else [value])]
     return words
