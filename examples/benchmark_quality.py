@@ -484,7 +484,10 @@ def main() -> None:
         parser.add_argument(f"--{name}", type=int, default=0, metavar="N", help=help)
     parser.add_argument("--seed", type=int, default=0)
     options = parser.parse_args()
-    for part in (sound, bad, steps, lengths):
+    parts = (sound, bad, steps, lengths)
+    if not any(getattr(options, part.__name__) for part in parts):
+        parser.print_help()
+    for part in parts:
         if count := getattr(options, part.__name__):
             part(count, options.seed)
 

@@ -37,7 +37,8 @@ def main() -> None:
     given = list(observations.point_names or ())
     keypoints, seen = observations.keypoints.numpy(), observations.visible.numpy()
     scores = np.ones(seen.shape) if observations.confidence is None else observations.confidence.numpy()
-    with zipfile.ZipFile(sys.argv[1], "w", zipfile.ZIP_DEFLATED) as archive:
+    path = sys.argv[1] if len(sys.argv) > 1 else "sample.zip"
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
 
         def put(name: str, text: str) -> None:
             archive.writestr(zipfile.ZipInfo(name), text, zipfile.ZIP_DEFLATED, 9)
@@ -66,6 +67,7 @@ def main() -> None:
             put("calibration/Calib.toml", Path(folder, "Calib.toml").read_text("utf-8"))
         put("Config.toml", f"[project]\nframe_rate = {session.fps:g}\n")
         put("skeleton.toml", f"points = {json.dumps(NAMES, indent=2)}\n")
+    print(path)
 
 
 if __name__ == "__main__":

@@ -10,9 +10,15 @@ from pathlib import Path
 import pytest
 
 EXAMPLES = sorted((Path(__file__).parents[1] / "examples").glob("*.py"))
+LONG = {"benchmark_lenses_and_clocks", "from_video_to_swing", "joint_training"}
+"""Examples that take 20 s and more."""
 
 
-@pytest.mark.parametrize("example", EXAMPLES, ids=lambda path: path.stem)
+def marked(example: Path) -> object:
+    return pytest.param(example, id=example.stem, marks=[pytest.mark.slow] if example.stem in LONG else [])
+
+
+@pytest.mark.parametrize("example", map(marked, EXAMPLES))
 def test_example_runs(example: Path, tmp_path: Path):
     alone = os.environ | {"OMP_NUM_THREADS": "1"}
     run = subprocess.run([sys.executable, str(example)], cwd=tmp_path, env=alone, capture_output=True, text=True, check=False)

@@ -111,6 +111,7 @@ def _of_some_frames(measurements: Measurements, columns: Tensor) -> Tensor:
 
 def _variance(squared: Tensor, near: Tensor, cameras: int, cut: float) -> Tensor:
     """Variance of the keypoints (B, P), from squared residuals below a cut: of those that take part, both (B, C, F', P)."""
+    near = near & squared.isfinite()  # points that have moved behind a camera since the keypoints were chosen
     by_point = (2 * near.sum(1) - 3).clamp_min(0)
     moments = _truncated_moments(cameras, cut).to(squared)
     expected = (by_point * moments[near.sum(1)]).sum(1).clamp_min(moments[2])

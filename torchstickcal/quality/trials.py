@@ -10,6 +10,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from torchstickcal.config import Config
 from torchstickcal.errors import CalibrationError
 from torchstickcal.geometry.cameras import Intrinsics
 from torchstickcal.observations import Observations
@@ -18,6 +19,8 @@ from torchstickcal.pipeline.run import Run
 from torchstickcal.quality.evidence import Evidence
 from torchstickcal.quality.resection import AGREEING_SIGMAS, LEAST_REACH, Resection, resected
 
+_TRIAL_ITERATIONS = 20
+"""Iterations of a stage of a trial at most: one that needs more explains nothing."""
 _SCALES = (1 / 3, 0.5, 2 / 3, 0.75, 4 / 3, 1.5, 2.0, 3.0)
 """Ratios of resolutions that videos are commonly converted by."""
 _LARGEST_SHIFT_S = 1.0
@@ -159,9 +162,13 @@ def without(evidence: Evidence, camera: int) -> Rest | None:
     return Rest(ended, points, ended.last.sigma_px[0])
 
 
-def tried(observations: Observations, config: object, refined: tuple[str, ...]) -> Adjustment | None:
-    """A session adjusted without anybody listening; None where its cameras are no rig."""
-    run = Run(config)  # type: ignore[arg-type]
+def tried(observations: Observations, config: Config, refined: tuple[str, ...]) -> Adjustment | None:
+    """A session adjusted in few iterations without anybody listening; None where its cameras are no rig."""
+    stages = {
+        name: replace(stage, max_iterations=min(stage.max_iterations, _TRIAL_ITERATIONS))
+        for name, stage in config.stages.items()
+    }
+    run = Run(replace(config, stages=stages))
     try:
         return adjust_cameras(begin(observations, run, refined), run)
     except CalibrationError:

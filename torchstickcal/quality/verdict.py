@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import enum
+import math
 from collections.abc import Iterable
 from dataclasses import asdict, dataclass, fields
 from typing import Any
@@ -81,6 +82,11 @@ class Acceptance:
     left_out_px: tuple[float, ...]
     """root mean square distance between the keypoints of each camera and the points of all others, pixels; NaN where there are
     no others"""
+
+    def __post_init__(self) -> None:
+        for name in ("metre_m", "calibration_share", "reprojection_px", "reprojection_mrad", "ray_distance_m"):
+            value = getattr(self, name)
+            object.__setattr__(self, name, value if math.isfinite(value) else math.nan)
 
     @property
     def sentence(self) -> str:
