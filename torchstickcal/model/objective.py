@@ -187,7 +187,8 @@ class Objective:
             (gradient,) = torch.autograd.grad(slope, step, create_graph=True)
             rows = [torch.autograd.grad(row.sum(), (deviations, points_cam), retain_graph=True) for row in gradient.unbind(-1)]
         hessian, by_points = (torch.stack(of, dim=2) for of in zip(*rows, strict=True))
-        return UnknownTerms(gradient.detach(), hessian, state.rotations.mT.unsqueeze(2) @ by_points)
+        by_points = (state.rotations.mT.unsqueeze(2) @ by_points).to(information.dtype)
+        return UnknownTerms(gradient.detach(), hessian, by_points)
 
     def linearise_prior(self, state: State) -> tuple[Tensor, Tensor, Tensor]:
         """The prior of the cameras' further unknowns: its value (B,), half its gradient (B, K), and its information (B, K)."""
