@@ -14,7 +14,7 @@ from fuzz.spoils.keypoints import SPOILS
 from torchstickcal import calibrate
 
 
-@budget(small=40, large=2000)
+@budget(small=20, large=2000)
 @given(
     session=st.one_of(spoiled_sessions(list(SPOILS)), spoiled_sessions(list(SPOILS)), spoiled_sessions()),
     config=st.one_of(st.just("default"), usable()),
