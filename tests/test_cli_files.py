@@ -58,8 +58,8 @@ def test_the_sample_is_calibrated_with_the_command_that_it_shows(sample: Path, r
 
 def test_results_are_upright_and_complete(results: Path):
     assert sorted(path.name for path in results.iterdir()) == [
-        "anipose.toml", "calibration.toml", "colmap", "opencap", "points.csv", "points.npz", "points.trc", "report.json",
-        "swing.trc",
+        "anipose.toml", "calibration.toml", "colmap", "opencap", "points.csv", "points.npz", "points.trc", "report.html",
+        "report.json", "swing.trc",
     ]  # fmt: skip
     report = json.loads((results / "report.json").read_text())
     assert report["world"]["name"] == "athlete"

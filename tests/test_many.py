@@ -252,7 +252,7 @@ def test_other_settings_need_another_folder(expected: tuple[Path, Any]):
 
 def test_the_code_of_the_settings_tells_what_changes_the_files():
     def code(config: Any = "default", refine: Any = None, path: str = "a.npz", stick: Any = None, **writing: Any) -> str:
-        write = _Writing(**{"config": "x", "export": None, "write": None, "world": "camera", "units": None} | writing)
+        write = _Writing(**{"config": "x", "write": None, "world": "camera", "units": None} | writing)
         source = Source("a", SessionFile(path, given=None if stick is None else Given(Stick(0, 1, stick))))
         return Settings(load_config(config), refine, None, write, None).code_of(source)
 
