@@ -160,7 +160,7 @@ def another(given: SimulatedSession, camera: int, rng: np.random.Generator, same
 
 
 def later(given: SimulatedSession, camera: int, frames: int) -> Observations:
-    """One camera some frames late."""
+    """The frames of one camera are some frames behind those of the others."""
     keypoints = given.observations.keypoints[camera]
     return with_camera(given.observations, camera, torch.cat([keypoints[frames:], keypoints[:frames] * torch.nan]))
 
@@ -395,17 +395,18 @@ def bad(count: int, seed: int) -> None:
         f"\n{'kind of bad session':46} {'n':>3} {'good':>5} {'usable':>6} {'poor':>5} {'failed':>6} {'refused':>7} "
         f"{'conf. wrong':>11} cause"
     )
-    wrong = told = right = 0
+    wrong = counted = right = 0
     for name, found in outcomes.items():
         verdicts = collections.Counter(outcome.verdict for outcome in found)
         own, named = sum(o.confidently_wrong for o in found), [o.right for o in found if o.verdict != "refused"]
-        said = f"{sum(named)}/{len(named)}" if KINDS[name].codes else "cannot be told"
+        said = f"{sum(named)}/{len(named)}" if KINDS[name].codes else "cannot be recognised"
         row = [verdicts[v] for v in ("good", "usable", "poor", "failed", "refused")]
         print(f"{name:46} {len(found):3} {row[0]:5} {row[1]:6} {row[2]:5} {row[3]:6} {row[4]:7} {own:11} {said}")
         if KINDS[name].tellable:
-            wrong, told, right = wrong + own, told + len(named), right + sum(named)
+            wrong, counted, right = wrong + own, counted + len(named), right + sum(named)
     print(
-        f"confidently wrong, of the kinds that can be told: {wrong}; right cause first: {right / max(told, 1):.0%} of {told}",
+        f"confidently wrong, of the kinds that can be recognised: {wrong}; "
+        f"right cause first: {right / max(counted, 1):.0%} of {counted}",
         flush=True,
     )
 

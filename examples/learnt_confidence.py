@@ -4,10 +4,10 @@
     python examples/learnt_confidence.py --full   # the table in docs/training.md
     torchrun --nproc-per-node 2 examples/learnt_confidence.py --full
 
-Cheap cameras are noisy, and run freely: each of their frames is up to 20 ms early or late. What moves fast is then wrong by
-centimetres. No label of an image shows this, because within one image nothing is wrong. But what moves fast is blurred, and
-that can be seen. The detections are simulated: three numbers for each keypoint, the length of its blur, the graininess of its
-image, and the detector's score.
+Cheap cameras are noisy and not synchronised: each of their frames is up to 20 ms too early or too late. Keypoints of fast
+points are then wrong by centimetres. No label of an image shows this, because within one image nothing is wrong. But what
+moves fast is blurred, and that can be seen. The detections are simulated: three numbers for each keypoint, the length of its
+blur, the graininess of its image, and the detector's score.
 
 A head of few numbers makes confidences of these. It learns from sessions of golf and baseball in rigs with known cameras, and
 is tested on hockey and kendo, with other athletes and rigs. `joint_training.py` is the same experiment on images.

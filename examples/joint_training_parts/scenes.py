@@ -2,8 +2,8 @@
 
 What makes keypoints wrong, each in its own way:
 
-* cheap cameras run freely: each of their frames is early or late by some milliseconds. Their exposure is long, so that what
-  moves fast is blurred; their images are soft and grainy;
+* cheap cameras are not synchronised: each of their frames is some milliseconds too early or too late. Their exposure
+  is long, so that what moves fast is blurred; their images are soft and grainy;
 * loose clothes: what is seen of a joint under them is displaced, differently in each camera, and stays so for the session;
 * limbs behind the trunk, things in front of the athlete, and a background of lines that look like sticks.
 """

@@ -125,7 +125,7 @@ def amended(observations: Observations, given: Given) -> tuple[Observations, tup
     """A session in which what the user gives replaces what the file holds.
 
     Raises:
-        CalibrationError: if something is given that a session cannot be told, or that does not fit to it.
+        CalibrationError: if something is given that a session cannot use, or that does not fit to it.
     """
     for name, value in (("person", given.person if given.person != AUTOMATIC else None), ("stick_points", given.stick_points)):
         if value is not None:
@@ -231,8 +231,8 @@ def _lenses(recording: Recording, given: Given) -> tuple[Lenses, list[str]]:
     """The intrinsics, and sentences about them."""
     labels = tuple(view.name for view in recording.views)
     sizes = [view.image_size for view in recording.views]
-    told = torch.tensor([size or (torch.nan, torch.nan) for size in sizes], dtype=torch.float64)
-    size = told if given.image_size is None else _sizes(given.image_size, labels, told)
+    stated = torch.tensor([size or (torch.nan, torch.nan) for size in sizes], dtype=torch.float64)
+    size = stated if given.image_size is None else _sizes(given.image_size, labels, stated)
     source = recording.intrinsics if given.intrinsics is None else given.intrinsics
     if source is not None:
         lenses, notes = lenses_of(_rig(source), labels, size, given.turned)
@@ -252,7 +252,7 @@ def _rig(source: Rig | str | Path) -> Rig:
     return source if isinstance(source, Rig) else read_calibration(source)
 
 
-def _sizes(given: Any, labels: Sequence[str], told: Tensor) -> Tensor:
+def _sizes(given: Any, labels: Sequence[str], stated: Tensor) -> Tensor:
     """The given image sizes (C, 2).
 
     Raises:
@@ -263,7 +263,7 @@ def _sizes(given: Any, labels: Sequence[str], told: Tensor) -> Tensor:
         expected = f"(2,) or ({len(labels)}, 2): width, height in pixels"
         raise CalibrationError("image size is not usable", where="image_size", got=size.tolist(), expected=expected)
     size = size.expand(len(labels), 2)
-    for label, own, read in zip(labels, size.tolist(), told.tolist(), strict=True):
+    for label, own, read in zip(labels, size.tolist(), stated.tolist(), strict=True):
         if not any(np.isnan(read)) and own != read:
             raise CalibrationError(
                 "another image size than the files say", where=f"image_size of {label}", got=own, expected=f"{read}, or none"

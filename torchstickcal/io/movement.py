@@ -34,8 +34,8 @@ def recording_of_movement(datasets: Mapping[str, Any], fps: float | None = None)
     """
     with reading("datasets of movement", "for each camera a dataset with position over time, space, keypoints and individuals"):
         views = [_view(name, dataset) for name, dataset in datasets.items()]
-        told = next((dataset.attrs.get("fps") for dataset in datasets.values()), None) if fps is None else fps
-        return Recording.of(views, fps=None if told is None else float(told))
+        stated = next((dataset.attrs.get("fps") for dataset in datasets.values()), None) if fps is None else fps
+        return Recording.of(views, fps=None if stated is None else float(stated))
 
 
 def _view(name: str, dataset: Any) -> View:

@@ -46,7 +46,7 @@ def attach_gradients(ended: Adjustment, data: Measurements, run: Run, mode: Grad
 
 
 def _levels(held: HeldNoise, result: StageResult, data: Measurements, before: State | None) -> NoiseLevels | None:
-    """The levels of the noise that a stage reckons with; None where they are those at its own minimum.
+    """The levels of the noise that a stage uses; None where they are those at its own minimum.
 
     Args:
         held: the noise of the stage.

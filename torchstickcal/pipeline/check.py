@@ -178,7 +178,7 @@ class CameraCheck:
         return all(_is_far(values[own], usual[own][:, own]) for own in unknowns.columns.values())
 
     def _inflation(self, names: tuple[str, ...]) -> float:
-        """How much larger the variances of a choice's values are than those told, by the scatter between parts of the frames.
+        """How much larger the variances of a choice's values are than those stated, by the scatter between parts of the frames.
 
         Errors that several points or cameras have in common in a frame are alike. That is seen here, not in any point's track.
         """

@@ -1,4 +1,4 @@
-"""How large the errors are that a stage reckons with, and its losses with them.
+"""How large the errors are that a stage uses, and its losses with them.
 
 Both depend on the state at which the errors are looked at. What is decided on the way, which keypoints take part and which
 correlations are real, is held as a :class:`NoiseGates`, so that the rest is a smooth function of state and measurements.
@@ -82,7 +82,7 @@ class NoiseGates:
 
 @dataclass(frozen=True)
 class StageNoise:
-    """The noise that a stage of a configuration reckons with.
+    """The noise that a stage of a configuration uses.
 
     Args:
         stage: the stage.
@@ -190,7 +190,7 @@ class HeldNoise:
         return Objective(kept, self.noise.losses(kept, NoiseLevels(*levels)))
 
     def minimum_near(self, measurements: Measurements, state: State, to_rounding: bool = True) -> tuple[Linearised, Tensor]:
-        """The minimum whose own noise the objective reckons with, near a state, and in which sessions it was found, (B,)."""
+        """The minimum whose own noise the objective uses, near a state, and in which sessions it was found, (B,)."""
 
         def objective_at(state: State) -> Objective:
             return self.objective(measurements, self.levels(measurements, state))

@@ -37,7 +37,7 @@ class Run:
         return dict(self._stages[self._number_of_camera_stages :])
 
     def noise_of(self, stage: Stage) -> StageNoise:
-        """The noise that a stage reckons with."""
+        """The noise that a stage uses."""
         return StageNoise(stage, self.config.given_sigma_px)
 
     @property

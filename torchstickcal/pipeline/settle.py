@@ -22,7 +22,7 @@ from torchstickcal.solvers.newton import minimum_near
 def settled(name: str, measurements: Measurements, result: StageResult, run: Run) -> tuple[StageResult, Tensor]:
     """A stage that estimated cameras, with the noise as it is found where the stage ends.
 
-    A stage reckons with the noise that was found where it began. That is a little different from the noise where it ends. Here
+    A stage uses the noise that was found where it began. That is a little different from the noise where it ends. Here
     both are brought to agree, with the keypoints that take part and all other decisions held.
 
     Args:

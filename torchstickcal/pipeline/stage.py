@@ -21,7 +21,7 @@ from torchstickcal.pipeline.scale import rulers, scale_factors
 from torchstickcal.solvers import StageRecord, Stop, Termination, solver
 
 _RESOLUTION = {torch.float64: 0.0, torch.float32: 1e-6}
-"""Relative decrease of the cost that can be told from rounding."""
+"""Relative decrease of the cost that can be distinguished from rounding."""
 _ROUGHLY = 1e-3
 """Relative decrease of the cost from which on a state is near the minimum."""
 _LEAST_AGREEING_SHARE = 0.15
@@ -40,7 +40,7 @@ class StageResult(NamedTuple):
     inliers: Tensor
     """(B, C, N), True where a keypoint took part"""
     noise: NoiseLevels
-    """with which the losses reckon, as estimated where the stage began"""
+    """that the losses use, as estimated where the stage began"""
     gates: NoiseGates
     """what was decided about it"""
     records: tuple[StageRecord, ...]

@@ -180,7 +180,7 @@ class Evidence:
         return found
 
     def explains_most(self, name: str) -> bool:
-        """Whether a cause explains more of the residuals than any other that is small enough to be told by linearising.
+        """Whether a cause explains more of the residuals than any other that is small enough to be found by linearising.
 
         Args:
             name: ``motion``, or a family of unknowns: ``lens`` or ``clock``.

@@ -22,7 +22,7 @@ class Family:
         description: one line, for lists.
         look: finds them.
         tries: whether it tries to explain what others found. It is asked only where something is wrong.
-        small: whether its findings are small errors, told by linearising. They are not said where a trial finds a larger one.
+        small: whether its findings are small errors, found by linearising. They are not said where a trial finds a larger one.
     """
 
     description: str
@@ -44,7 +44,7 @@ def findings(
         name: of the family.
         description: one line, for lists.
         tries: whether it tries to explain what others found. It is asked only where the verdict is poor or failed.
-        small: whether its findings are small errors, told by linearising. They are not said where a trial finds a larger one.
+        small: whether its findings are small errors, found by linearising. They are not said where a trial finds a larger one.
         replace: whether it may take the place of another of that name.
 
     Raises:

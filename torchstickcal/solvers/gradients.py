@@ -1,8 +1,8 @@
 """Gradients through a minimum, by the implicit function theorem.
 
 At a minimum theta the gradient ``g(theta, y)`` of the objective is zero for any data y. So d theta / dy = -G^-1 dg/dy with the
-derivative G of g by theta. Where nothing else depends on theta, G is the exact Hessian H. The noise that the objective reckons
-with may be estimated at the minimum itself, as levels ``n(theta, y)``. Then G = H + dg/dn dn/dtheta.
+derivative G of g by theta. Where nothing else depends on theta, G is the exact Hessian H. The noise that the objective
+uses may be estimated at the minimum itself, as levels ``n(theta, y)``. Then G = H + dg/dn dn/dtheta.
 
 The backward pass solves one linear system, ``G^T v = u`` with the incoming gradient u. Then it differentiates the directional
 derivative ``g . v`` with respect to the data, directly and by the levels. The gradient modes differ in how they solve linear
@@ -44,7 +44,7 @@ Levels = tuple[Tensor, ...]
 
 
 class NoiseModel(Protocol):
-    """An objective that reckons with the noise that is found at a state."""
+    """An objective that uses the noise that is found at a state."""
 
     def levels(self, measurements: Measurements, state: State) -> Levels:
         """The levels of the noise at a state, differentiable by measurements and state."""
@@ -160,7 +160,7 @@ def attach(
     If clocks are among the unknowns, the velocity of the keypoints in the image is treated as a constant.
 
     Args:
-        model: the objective, and the noise that it reckons with.
+        model: the objective, and the noise that it uses.
         measurements: what was measured. Pixels, confidence, cameras, lengths and priors may require gradients.
         minimum: the minimised objective at its minimum.
         mode: how to solve linear systems in the Hessian.
@@ -241,7 +241,7 @@ class _Minimum(torch.autograd.Function):
 
 
 class _Levels:
-    """The levels of the noise that an objective reckons with, as leaves, and what they follow from.
+    """The levels of the noise that an objective uses, as leaves, and what they follow from.
 
     Args:
         found: as functions of a state and of what was measured; empty where they were given.

@@ -1,6 +1,6 @@
 """Newton's method with the exact Hessian, to take a solver's result to the minimum up to rounding errors.
 
-It converges quickly where Gauss-Newton converges only linearly. Where the noise that the objective reckons with depends on the
+It converges quickly where Gauss-Newton converges only linearly. Where the noise that the objective uses depends on the
 state, both are brought to agree: the state is the minimum for the noise that is found there.
 """
 

@@ -61,7 +61,7 @@ def _in_step(evidence: Evidence) -> bool:
 
 
 def _apart(evidence: Evidence) -> bool:
-    """Whether the points do not fit together, or say that some camera is clearly early or late."""
+    """Whether the points do not fit together, or say that the clock of some camera is clearly ahead or behind."""
     rate, offset = evidence.ended.frames[0].rate_hz, evidence.unknowns["time_offset"]
     difference = (offset.suggested - offset.given).abs()
     clear = (difference * (rate or 1.0) > _WRONG_FRAMES) & (difference > _CONTRADICTED_SIGMAS * offset.suggested_std)
