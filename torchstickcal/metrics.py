@@ -80,9 +80,9 @@ def pose_errors(
     )
     centres, true_centres = se3.camera_centres(r, t), se3.camera_centres(r_true, t_true)
     by_first = r_true[..., 0, :, :].mT @ r[..., 0, :, :]
-    scale = centres.new_ones(())
+    scale, on_line = centres.new_ones(()), _collinear(true_centres)
     if alignment in ("rigid", "similarity"):
-        collinear = _collinear(true_centres)[..., None, None]
+        collinear = on_line[..., None, None]
         by_centres, _ = align(centres, true_centres)
         rotation = by_first.where(collinear, by_centres)
         moved = centres @ rotation.mT
@@ -103,20 +103,20 @@ def pose_errors(
     return PoseErrors(
         rotation_deg=rotation_angle(r_true @ rotation[..., None, :, :] @ r.mT).rad2deg(),
         translation_m=(laid - true_centres).norm(dim=-1),
-        aligned_by=_aligned_by(alignment, true_centres),
+        aligned_by=_aligned_by(alignment, r_true.shape[-3], on_line),
     )
 
 
-def _aligned_by(alignment: Alignment, true_centres: Tensor) -> str:
+def _aligned_by(alignment: Alignment, cameras: int, on_line: Tensor) -> str:
     """What was laid onto the truth, in words."""
     scale = "and scale" if alignment == "similarity" else "no scale"
     if alignment == "none":
         return "nothing: the worlds are the same"
     if alignment == "first_camera":
         return "pose of the first camera, rotation and translation, no scale"
-    if bool(_collinear(true_centres).all()):
+    if bool(on_line.all()):
         return f"pose of the first camera, rotation and translation, {scale} (the camera centres lie on one line)"
-    return f"all {true_centres.shape[-2]} camera centres, rotation and translation, {scale}"
+    return f"all {cameras} camera centres, rotation and translation, {scale}"
 
 
 def _collinear(centres: Tensor) -> Tensor:

@@ -10,11 +10,12 @@ import math
 import os
 import re
 import stat
+import typing
 import zipfile
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any, BinaryIO, TypeVar
 from xml.etree import ElementTree
 
 import numpy as np
@@ -24,6 +25,7 @@ from numpy.typing import NDArray
 from torchstickcal.errors import CalibrationError, FileFormatError
 from torchstickcal.files import parse_toml
 
+_Row = TypeVar("_Row")
 GROWTH = 100
 """How much more memory the content of a file may need than the file is long. Keypoints of which one in a hundred is seen stay
 below."""
@@ -383,3 +385,17 @@ def _not_regular(path: str | Path, got: str) -> FileFormatError:
 
 def _shortened(text: str) -> str:
     return text if len(text) <= _LONGEST_CAUSE else f"{text[:_LONGEST_CAUSE]}..."
+
+
+def row_of(kind: type[_Row], values: dict[str, Any]) -> _Row:
+    """A row, a dataclass of numbers and texts, from a line of a file.
+
+    Raises:
+        TypeError: if a value is missing, unknown, or of another type.
+    """
+    row = kind(**values)
+    for name, expected in typing.get_type_hints(kind).items():
+        value = getattr(row, name)
+        if not isinstance(value, expected) and not (type(value) is int and isinstance(0.0, expected)):
+            raise TypeError(f"{name} is {value!r}")
+    return row

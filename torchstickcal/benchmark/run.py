@@ -5,13 +5,12 @@ from __future__ import annotations
 import json
 import os
 import time
-import typing
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import as_completed
 from dataclasses import asdict, dataclass
 from functools import lru_cache, partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import torch
 
@@ -24,7 +23,7 @@ from torchstickcal.errors import CalibrationError, FileFormatError
 from torchstickcal.files import json_text
 from torchstickcal.metrics import PoseErrors, pose_errors
 from torchstickcal.processes import WorkerProcesses
-from torchstickcal.untrusted import read_bytes
+from torchstickcal.untrusted import read_bytes, row_of
 
 ROWS_FILE = "rows.jsonl"
 _JOBS_PER_PROCESSOR = 8
@@ -144,23 +143,9 @@ def read_rows(file: Path) -> list[Row]:
     if len(whole) < len(content):
         file.write_bytes(whole)
     try:
-        return [_row(json.loads(line)) for line in whole.splitlines()]
+        return [row_of(Row, json.loads(line)) for line in whole.splitlines()]
     except (ValueError, TypeError, RecursionError) as error:
         raise FileFormatError("not a file of measurements", where=str(file), got=str(error), expected="rows") from error
-
-
-def _row(values: dict[str, Any]) -> Row:
-    """A row from its line.
-
-    Raises:
-        TypeError: if a value is missing, unknown, or of another type.
-    """
-    row = Row(**values)
-    for name, kind in typing.get_type_hints(Row).items():
-        value = getattr(row, name)
-        if not isinstance(value, kind) and not (type(value) is int and isinstance(0.0, kind)):
-            raise TypeError(f"{name} is {value!r}")
-    return row
 
 
 def measure(place: str, source: Source, name: str) -> Row | None:

@@ -79,9 +79,7 @@ def parser() -> argparse.ArgumentParser:
 
 def _add_calibrate(commands: Any) -> None:
     command = commands.add_parser("calibrate", help="calibrate a session", description="Calibrate a session.")
-    command.add_argument(
-        "session", metavar="SESSION", type=_path, nargs="+", help="file or folder of a session; or one file for each camera"
-    )
+    _add_session(command)
     _add_out(command, "results")
     _add_format(command, "SESSION")
     _add_given(command)
@@ -123,17 +121,11 @@ def _add_check(commands: Any) -> None:
     command.add_argument(
         "calibration", metavar="CALIBRATION", type=_path, help="folder that `calibrate` wrote, or a calibration file"
     )
-    command.add_argument(
-        "session", metavar="SESSION", type=_path, nargs="+", help="file or folder of a session; or one file for each camera"
-    )
+    _add_session(command)
     _add_format(command, "SESSION")
     _add_given(command)
     command.add_argument("--json", metavar="FILE", type=_path, help="write the verdict and the findings as JSON")
-    command.add_argument(
-        "--units",
-        choices=("m", "cm", "mm"),
-        help="unit of length of a calibration file that does not say it (aniposelib, COLMAP)",
-    )
+    _add_units(command)
     _add_strict(command)
     _add_plugin(command)
     command.set_defaults(run=check_session)
@@ -195,9 +187,7 @@ def _add_triangulate(commands: Any) -> None:
         help="find the points of a recording by cameras that were calibrated before",
         description="Find the points of a recording, in metres, by cameras that were calibrated before and not moved since.",
     )
-    command.add_argument(
-        "session", metavar="SESSION", type=_path, nargs="+", help="file or folder of a recording; or one file for each camera"
-    )
+    _add_session(command, "a recording")
     command.add_argument(
         "--calibration",
         metavar="DIR|FILE",
@@ -209,7 +199,7 @@ def _add_triangulate(commands: Any) -> None:
     _add_format(command, "SESSION")
     _add_recording(command)
     _add_config(command)
-    command.add_argument("--no-sync", action="store_true", help="do not estimate clocks: the cameras are synchronised")
+    _add_no_sync(command)
     _add_write(command, "points: trc, c3d, csv, npz (default: npz);")
     _add_units(command)
     _add_plugin(command)
@@ -220,12 +210,10 @@ def _add_info(commands: Any) -> None:
     command = commands.add_parser(
         "info",
         help="show what a recording holds",
-        description="Show what a recording holds: cameras, frames, which camera sees which point how often, which pairs of "
-        "cameras see the same, and how precise a calibration would be.",
+        description="Show what a recording holds: cameras, frames, which camera sees which point how often, and which pairs "
+        "of cameras see the same.",
     )
-    command.add_argument(
-        "session", metavar="SESSION", type=_path, nargs="+", help="file or folder of a session; or one file for each camera"
-    )
+    _add_session(command)
     _add_format(command, "SESSION")
     _add_given(command)
     command.add_argument("--json", metavar="FILE", type=_path, help="write the same as JSON")
@@ -338,6 +326,16 @@ def _add_strict(command: argparse.ArgumentParser) -> None:
     command.add_argument("--strict", action="store_true", help="count the verdict `usable` as poor: exit status 3 instead of 0")
 
 
+def _add_session(command: argparse.ArgumentParser, what: str = "a session") -> None:
+    command.add_argument(
+        "session", metavar="SESSION", type=_path, nargs="+", help=f"file or folder of {what}; or one file for each camera"
+    )
+
+
+def _add_no_sync(command: argparse.ArgumentParser) -> None:
+    command.add_argument("--no-sync", action="store_true", help="do not estimate clocks: the cameras are synchronised")
+
+
 def _add_config(command: argparse.ArgumentParser) -> None:
     help = "name from `torchstickcal list configs`, or a TOML file (default: default)"
     command.add_argument("--config", metavar="NAME|FILE", default="default", help=help)
@@ -417,7 +415,7 @@ def _add_refining(command: argparse.ArgumentParser) -> None:
         help="what to estimate of the cameras beside their poses: names from `torchstickcal list unknowns`, `none`, or `auto` "
         "for what the keypoints contradict (default: as in the configuration, else auto)",
     )
-    command.add_argument("--no-sync", action="store_true", help="do not estimate clocks: the cameras are synchronised")
+    _add_no_sync(command)
     command.add_argument(
         "--stick-length", metavar="M", type=float, help="length of the stick in metres (default: the session's)"
     )

@@ -31,9 +31,7 @@ def chosen_writers(names: str | None = None) -> dict[str, Writer]:
     Raises:
         CalibrationError: for an unknown format, or if two files have the same name.
     """
-    return _distinct(
-        dict.fromkeys([CAMERAS_FORMAT, *(names.split(",") if names else ())]), {POINTS_FILE, REPORT_FILE, PAGE_FILE}
-    )
+    return _distinct([CAMERAS_FORMAT, *(names.split(",") if names else ())], {POINTS_FILE, REPORT_FILE, PAGE_FILE})
 
 
 def point_writers(names: str | None) -> dict[str, Writer]:
@@ -42,7 +40,7 @@ def point_writers(names: str | None) -> dict[str, Writer]:
     Raises:
         CalibrationError: also for a format that does not hold points.
     """
-    writers = _distinct(dict.fromkeys(names.split(",") if names else ["npz"]), {REPORT_FILE})
+    writers = _distinct(names.split(",") if names else ["npz"], {REPORT_FILE})
     for name, writer in writers.items():
         if writer.writes != "points":
             raise CalibrationError(
@@ -52,7 +50,7 @@ def point_writers(names: str | None) -> dict[str, Writer]:
 
 
 def _distinct(names: Iterable[str], taken: set[str]) -> dict[str, Writer]:
-    """Writers of formats or files, by the names of their files.
+    """Writers of formats or files, by the names of their files. One that is named twice counts once.
 
     Raises:
         CalibrationError: for an unknown format, for a file elsewhere, or if two files have the same name.
@@ -61,7 +59,7 @@ def _distinct(names: Iterable[str], taken: set[str]) -> dict[str, Writer]:
     from torchstickcal.io import CALIBRATION_WRITERS
 
     writers: dict[str, Writer] = {}
-    for name in names:
+    for name in dict.fromkeys(names):
         if name not in CALIBRATION_WRITERS and "." in name:
             if Path(name).name != name:
                 expected = "the name of a file alone, which is written to the folder of the results"

@@ -4,16 +4,14 @@ from __future__ import annotations
 
 import json
 import os
-import typing
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
 
 from torchstickcal.errors import CalibrationError, FileFormatError
 from torchstickcal.files import json_text
-from torchstickcal.untrusted import read_bytes
+from torchstickcal.untrusted import read_bytes, row_of
 
 try:
     import fcntl
@@ -122,24 +120,10 @@ def _rows(file: Path) -> Iterator[SessionRow]:
     content = read_bytes(file)
     for number, line in enumerate(content[: content.rfind(b"\n") + 1].splitlines(), 1):
         try:
-            yield _row(json.loads(line))
+            yield row_of(SessionRow, json.loads(line))
         except (ValueError, TypeError, RecursionError) as error:
             where = f"{file}, line {number}"
             raise FileFormatError("not a manifest", where=where, got=str(error), expected="a row of a session") from error
-
-
-def _row(values: dict[str, Any]) -> SessionRow:
-    """A row from its line.
-
-    Raises:
-        TypeError: if a value is missing, unknown, or of another type.
-    """
-    row = SessionRow(**values)
-    for name, kind in typing.get_type_hints(SessionRow).items():
-        value = getattr(row, name)
-        if not isinstance(value, kind) and not (type(value) is int and isinstance(0.0, kind)):
-            raise TypeError(f"{name} is {value!r}")
-    return row
 
 
 def _write_whole(descriptor: int, content: bytes) -> None:

@@ -12,8 +12,8 @@ from torchstickcal.processes import SPAWN
 PROCESS_BYTES = 400_000_000
 """What a process needs before it has read a session."""
 _SESSION_BYTES, _KEYPOINT_BYTES, _FURTHER_KEYPOINT_BYTES = 50_000_000, 1100, 130
-"""What a calibration needs in addition: at most so much, and for each keypoint of the session, measured from 6 thousand to 36
-million keypoints."""
+"""What a calibration needs in addition: at most so much, and for each keypoint of the session, measured from 6 to 840
+thousand keypoints; beyond a million it was not."""
 _MOST_CHECKED = 1_000_000
 """Keypoints beyond which a longer session needs less for each: its lenses and clocks are checked on a part of it."""
 

@@ -159,7 +159,6 @@ def _calibrated(source: Source, settings: Settings) -> tuple[Calibration, str | 
 
 
 def _row(task: Task, calibration: Calibration, seconds: float, folder: str | None) -> SessionRow:
-    quality = getattr(calibration, "quality", None)
     residuals = calibration.residuals_px.norm(dim=-1)[calibration.inliers]
     return SessionRow(
         name=task.source.name,
@@ -168,7 +167,7 @@ def _row(task: Task, calibration: Calibration, seconds: float, folder: str | Non
         outcome=CONVERGED if calibration.converged else NOT_CONVERGED,
         status=calibration.status,
         error=None,
-        verdict=None if quality is None else str(quality.verdict.value),
+        verdict=calibration.quality.verdict.value,
         cameras=len(calibration.rotations),
         frames=calibration.frame_index.shape[1],
         keypoints=int(calibration.inliers.sum()),

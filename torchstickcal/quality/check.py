@@ -2,7 +2,7 @@
 
 The points of the new recording are triangulated by the old cameras. The camera whose change explains most of the residuals is
 placed again, and the points with it, until no camera is left that the old calibration contradicts. So few cameras that moved
-are told from many that did not.
+are distinguished from many that did not.
 """
 
 from __future__ import annotations
@@ -15,7 +15,6 @@ from torch import Tensor
 from torchstickcal.config import InitialiseSettings
 from torchstickcal.errors import ObservationError
 from torchstickcal.geometry import se3
-from torchstickcal.geometry.singular import covariance_root
 from torchstickcal.metrics import rotation_angle
 from torchstickcal.model.measurements import Measurements
 from torchstickcal.model.noise import estimate_sigma_px
@@ -23,7 +22,7 @@ from torchstickcal.model.state import State
 from torchstickcal.observations import Observations
 from torchstickcal.pipeline.initialise import triangulated
 from torchstickcal.quality.finding import Finding, Severity
-from torchstickcal.quality.linear import FramePulls
+from torchstickcal.quality.linear import FramePulls, variance_of_sums
 from torchstickcal.quality.moved import motion_of
 from torchstickcal.quality.resection import resected
 from torchstickcal.quality.verdict import Quality
@@ -35,6 +34,8 @@ _MOST_FRAMES = 240
 _REJECT_SIGMAS = 6.0
 _LEAST_EVIDENCE = 45.0
 """Squared length of a change in its standard deviations, from which on a camera has moved."""
+_BLOCKS = (12, 24)
+"""Numbers of blocks of frames from whose scatter the variance of a change is estimated."""
 _PRIOR_M, _PRIOR_RAD = 0.3, 0.2
 _HARMLESS_DEG, _HARMLESS_M = 0.05, 0.003
 """A change that no lab would calibrate again for."""
@@ -144,7 +145,7 @@ class _Rig:
         prior = pull.new_tensor([1 / _PRIOR_M**2] * 3 + [1 / _PRIOR_RAD**2] * 3).diag()
         change = torch.linalg.solve(own + prior, pull)
         parts = self.pulls.information[:, place, place]
-        scatter = _lasting(self.pulls.gradient_by_part[:, camera] - parts @ change, parts)
+        scatter = max(1.0, variance_of_sums(self.pulls.gradient_by_part[:, camera] - parts @ change, parts, _BLOCKS))
         covariance = scatter * torch.linalg.inv(own + prior)
         if not exact:
             covariance = covariance + self.old.variance_of(camera).to(pull)
@@ -284,17 +285,6 @@ def _lengths(rig: _Rig, observations: Observations) -> list[Finding]:
                 )
             )
     return found
-
-
-def _lasting(pull: Tensor, own: Tensor) -> float:
-    """Variance of the sum of pulls (K, 6), over that of independent keypoints, at least 1."""
-    white = pull @ covariance_root(own.mean(0))
-    found = [1.0]
-    for blocks in (12, 24, len(white)):
-        length = max(1, len(white) // blocks)
-        sums = white[: len(white) // length * length].unflatten(0, (-1, length)).sum(1) / length**0.5
-        found.append(float(sums.square().mean()))
-    return max(found)
 
 
 def _of_frames(observations: Observations, frames: Tensor) -> Measurements:

@@ -80,8 +80,8 @@ class Finding:
             "cameras": list(self.cameras),
             "points": list(self.points),
             "frames": None if self.frames is None else list(self.frames),
-            "figure": _finite(self.figure),
-            "limit": _finite(self.limit),
+            "figure": self.figure,
+            "limit": self.limit,
             "unit": self.unit,
             "is_cause": self.is_cause,
         }
@@ -106,5 +106,5 @@ class Finding:
 
 
 def _finite(value: float | None) -> float | None:
-    """JSON has no NaN and no infinity."""
+    """A number as JSON can hold it; None for one that is not finite."""
     return float(value) if value is not None and math.isfinite(value) else None

@@ -22,9 +22,9 @@ def _judged(evidence: Evidence) -> Quality:
     every = [finding for own in found.values() for finding in own]
     wrong = any(finding.severity >= Severity.SERIOUS for finding in every)
     large = any(finding.is_cause for family, own in found.items() if not family.small for finding in own)
-    told = large or (evidence.consistent and any(finding.is_cause for finding in every))
+    explained = large or (evidence.consistent and any(finding.is_cause for finding in every))
     doubtful = any(finding.code == "camera_doubtful" for finding in every)
-    if (wrong or doubtful) and not told:
+    if (wrong or doubtful) and not explained:
         causes = [finding for family in FAMILIES.values() if family.tries for finding in _findings(family, evidence)]
         if causes:
             every = [finding for family, own in found.items() if not family.small for finding in own]

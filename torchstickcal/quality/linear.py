@@ -6,11 +6,13 @@ which direction, its keypoints pull at the pose of each camera, when every point
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
+from torchstickcal.geometry.singular import covariance_root
 from torchstickcal.geometry.symmetric import IDENTITY, cholesky, forward
 from torchstickcal.losses import ReprojectionLoss
 from torchstickcal.losses.robust import GemanMcClure
@@ -76,6 +78,24 @@ class FramePulls:
     def first_frame(self, part: int) -> int:
         """The first frame of a part."""
         return int((self.part == part).nonzero()[0])
+
+
+def variance_of_sums(pull: Tensor, own: Tensor, blocks: Sequence[int]) -> float:
+    """Variance of sums of pulls (K, 6), over that of independent keypoints with the noise that they were found to have.
+
+    It is the largest of that of single parts, and of sums over each number of blocks of parts.
+
+    Args:
+        pull: of one camera.
+        own: information about it, (K, 6, 6).
+        blocks: numbers of blocks.
+    """
+    white = pull @ covariance_root(own.mean(0))
+    found = []
+    for length in {1, *(max(1, len(white) // count) for count in blocks)}:
+        sums = white[: len(white) // length * length].unflatten(0, (-1, length)).sum(1) / length**0.5
+        found.append(float(sums.square().mean()))
+    return max(found)
 
 
 def _reduced(gradients: Tensor, blocks: Tensor, points: Tensor, seen: Tensor, per_frame: int) -> tuple[Tensor, Tensor]:

@@ -14,8 +14,8 @@ import torch
 from torch import Tensor
 
 from torchstickcal.geometry import se3
-from torchstickcal.geometry.singular import covariance_of, covariance_root
-from torchstickcal.quality.linear import FramePulls
+from torchstickcal.geometry.singular import covariance_of
+from torchstickcal.quality.linear import FramePulls, variance_of_sums
 
 LEAST_EVIDENCE = 32.0
 """Squared length of the change in its standard deviations, from which on a camera is said to have moved: 6 numbers are fitted
@@ -25,8 +25,8 @@ _PRIOR_M, _PRIOR_RAD = 0.03, 0.02
 _LEAST_FRAMES = 12
 _EDGE = 0.04
 """Share of a session at each end in which no change is looked for: too few frames speak for it."""
-_BLOCKS = 12
-"""Blocks of frames from whose scatter the variance is estimated."""
+_BLOCKS = (12, 24, 48)
+"""Numbers of blocks of frames from whose scatter the variance is estimated."""
 
 
 class Motion(NamedTuple):
@@ -101,14 +101,14 @@ def _changes(camera: int, gradient: Tensor, information: Tensor, inverse: Tensor
     changes, evidence = _scored(after, rows_after[..., place], rows_after, inverse, prior)
     best = int(evidence.argmax())
     step = torch.arange(parts, device=pull.device) >= steps[best]
-    variance = _variance(pull - _explained(rows[..., place], step.to(pull), changes[best]), rows[..., place])
+    variance = variance_of_sums(pull - _explained(rows[..., place], step.to(pull), changes[best]), rows[..., place], _BLOCKS)
     ramp = torch.linspace(-0.5, 0.5, parts).to(pull)
     drawn = (ramp[:, None] * pull).sum(0), (ramp[:, None, None] * rows).sum(0)
     squared = (ramp.square()[:, None, None] * rows[..., place]).sum(0)
     drift, drift_evidence = _scored(drawn[0][None], squared[None], drawn[1][None], inverse, prior)
     gradual = float(drift_evidence) > float(evidence[best])
     if gradual:
-        variance = _variance(pull - _explained(rows[..., place], ramp, drift[0]), rows[..., place])
+        variance = variance_of_sums(pull - _explained(rows[..., place], ramp, drift[0]), rows[..., place], _BLOCKS)
     strongest = max(float(drift_evidence), float(evidence[best]))
     tangent, part = (drift[0], 0) if gradual else (changes[best], int(steps[best]))
     return _Change(strongest / variance, part, tangent, gradual)
@@ -125,16 +125,6 @@ def _explained(own: Tensor, share: Tensor, change: Tensor) -> Tensor:
     """Pulls (K, 6) that a change explains, of which each part has a share (K,), up to a constant."""
     share = share - share.mean()
     return -share[:, None] * (own @ change)
-
-
-def _variance(pull: Tensor, own: Tensor) -> float:
-    """Variance of sums of pulls (K, 6), over that of independent keypoints with the noise that they were found to have."""
-    white = pull @ covariance_root(own.mean(0))
-    found = []
-    for length in {1, max(1, len(white) // (4 * _BLOCKS)), max(1, len(white) // (2 * _BLOCKS)), max(1, len(white) // _BLOCKS)}:
-        blocks = white[: len(white) // length * length].unflatten(0, (-1, length)).sum(1) / length**0.5
-        found.append(float(blocks.square().mean()))
-    return max(found)
 
 
 def _from(values: Tensor) -> Tensor:

@@ -8,6 +8,7 @@ from collections.abc import Iterable
 from dataclasses import asdict, dataclass, fields
 from typing import Any
 
+from torchstickcal.files import without_nan
 from torchstickcal.quality.finding import Finding, Severity
 
 
@@ -147,7 +148,7 @@ class Quality:
         """The quality as JSON can hold it; :meth:`from_json` reads it back."""
         acceptance = None
         if self.acceptance is not None:
-            acceptance = _without_nan(asdict(self.acceptance)) | {"sentence": self.acceptance.sentence}
+            acceptance = without_nan(asdict(self.acceptance)) | {"sentence": self.acceptance.sentence}
         return {
             "verdict": self.verdict.value,
             "findings": [finding.as_json() for finding in self.findings],
@@ -177,12 +178,3 @@ def _length_errors(content: dict[str, Any]) -> LengthErrors:
 
 def _number(value: Any) -> float:
     return float("nan") if value is None else float(value)
-
-
-def _without_nan(value: Any) -> Any:
-    """JSON has no NaN and no infinity: None in their place."""
-    if isinstance(value, dict):
-        return {name: _without_nan(part) for name, part in value.items()}
-    if isinstance(value, (list, tuple)):
-        return [_without_nan(part) for part in value]
-    return None if isinstance(value, float) and not abs(value) < float("inf") else value

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from torchstickcal.files import without_nan
 from torchstickcal.reconstruction import Reconstruction
-from torchstickcal.show.tables import printable, text_table
+from torchstickcal.show.tables import point_name, printable, stick_rows, text_table
 
 
 def table(found: Reconstruction) -> str:
@@ -25,14 +25,8 @@ def table(found: Reconstruction) -> str:
         rows.append([printable(name), str(frames), f"{1000 * std:.2f}" if std == std else "-"])
     text += [text_table(rows), ""]
     if found.sticks:
-        rows = [["stick (not used)", "given (m)", "mean (m)", "spread (mm)", "frames"]]
-        for stick, lengths in zip(found.sticks, found.stick_lengths_m.mT, strict=True):
-            known = lengths[lengths.isfinite()]
-            ends = " - ".join(printable(_names(found)[end]) for end in stick.ends)
-            mean = f"{float(known.mean()):.5f}" if len(known) else "-"
-            spread = f"{1000 * float(known.std()):.2f}" if len(known) > 1 else "-"
-            rows.append([ends, f"{stick.length_m:.5f}", mean, spread, str(len(known))])
-        text += [text_table(rows), ""]
+        heads = ("stick (not used)", "given (m)", "mean (m)", "spread (mm)", "frames")
+        text += [text_table([heads, *stick_rows(found)]), ""]
     text.append(found.world.description)
     text += [f"warning: {warning}" for warning in found.warnings]
     return "\n".join(text)
@@ -76,7 +70,7 @@ def summary(found: Reconstruction) -> dict[str, Any]:
 
 
 def _names(found: Reconstruction) -> list[str]:
-    return list(found.point_names or (f"point {number}" for number in range(found.points.shape[1])))
+    return [point_name(found, number) for number in range(found.points.shape[1])]
 
 
 def _used(found: Reconstruction) -> list[int]:

@@ -56,26 +56,21 @@ def summary(calibration: Calibration) -> dict[str, Any]:
             "world": dataclasses.asdict(calibration.world),
             "cameras": [
                 {
-                    "name": name,
-                    "centre_m": centre,
+                    "name": facts.name,
+                    "centre_m": facts.centre_m,
                     "rotation": rotation,
                     "translation_m": translation,
-                    "centre_std_m": std_m,
-                    "rotation_std_deg": std_deg,
-                    "reprojection_median_px": median_px,
-                    "keypoints": keypoints,
+                    "centre_std_m": facts.std_m,
+                    "rotation_std_deg": facts.std_deg,
+                    "reprojection_median_px": facts.median_px,
+                    "keypoints": facts.used,
                     "frames_relabelled": relabelled,
                     "frames_of_another_person": other,
                 }
-                for name, centre, rotation, translation, std_m, std_deg, median_px, keypoints, relabelled, other in zip(
-                    calibration.camera_names,
-                    calibration.camera_centres.tolist(),
+                for facts, rotation, translation, relabelled, other in zip(
+                    camera_facts(calibration),
                     calibration.rotations.tolist(),
                     calibration.translations.tolist(),
-                    calibration.camera_std_m.tolist(),
-                    calibration.camera_std_deg.tolist(),
-                    calibration.reprojection_median_px.tolist(),
-                    _keypoints_used(calibration),
                     calibration.relabelled.any(-1).sum(-1).tolist(),
                     calibration.other_person.sum(-1).tolist(),
                     strict=True,
@@ -132,7 +127,3 @@ def _parameter_summary(calibration: Calibration, parameter: CameraParameter) -> 
             for camera, name in enumerate(calibration.camera_names)
         ],
     }
-
-
-def _keypoints_used(calibration: Calibration) -> list[int]:
-    return calibration.inliers.flatten(1).sum(1).tolist()

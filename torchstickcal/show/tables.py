@@ -10,6 +10,7 @@ from typing import NamedTuple
 from torch import Tensor
 
 from torchstickcal.model.unknowns import all_unknowns
+from torchstickcal.reconstruction import Reconstruction
 from torchstickcal.result import Calibration, CameraParameter
 from torchstickcal.show.look import digits, share, with_std
 
@@ -103,14 +104,14 @@ def printable(text: str) -> str:
     return "".join(letter if letter.isprintable() else letter.encode("unicode_escape").decode() for letter in text)
 
 
-def point_name(calibration: Calibration, index: int) -> str:
+def point_name(found: Calibration | Reconstruction, index: int) -> str:
     """The name of a point, or its number."""
-    return calibration.point_names[index] if calibration.point_names else f"point {index}"
+    return found.point_names[index] if found.point_names else f"point {index}"
 
 
-def stick_name(calibration: Calibration, stick: int) -> str:
+def stick_name(found: Calibration | Reconstruction, stick: int) -> str:
     """The names of a stick's ends."""
-    return " - ".join(point_name(calibration, end) for end in calibration.sticks[stick].ends)
+    return " - ".join(point_name(found, end) for end in found.sticks[stick].ends)
 
 
 def keypoints_seen(calibration: Calibration) -> Tensor:
@@ -226,13 +227,18 @@ def stick_table(calibration: Calibration) -> Table | None:
         Column("spread", "mm", "standard deviation of the reconstructed lengths"),
         Column("frames", "", "frames in which both ends are known"),
     )
-    rows = []
-    for number, (stick, lengths) in enumerate(zip(calibration.sticks, calibration.stick_lengths_m.mT, strict=True)):
+    return Table("Sticks", columns, tuple(stick_rows(calibration)))
+
+
+def stick_rows(found: Calibration | Reconstruction) -> list[tuple[str, ...]]:
+    """Of each stick: its name, the given and the mean length (m), their spread (mm), and the number of frames."""
+    rows: list[tuple[str, ...]] = []
+    for number, (stick, lengths) in enumerate(zip(found.sticks, found.stick_lengths_m.mT, strict=True)):
         known = lengths[lengths.isfinite()]
         spread = f"{1000 * float(known.std()):.2f}" if len(known) > 1 else "-"
         mean = f"{float(known.mean()):.5f}" if len(known) else "-"
-        rows.append((stick_name(calibration, number), f"{stick.length_m:.5f}", mean, spread, str(len(known))))
-    return Table("Sticks", columns, tuple(rows))
+        rows.append((stick_name(found, number), f"{stick.length_m:.5f}", mean, spread, str(len(known))))
+    return rows
 
 
 def point_table(calibration: Calibration) -> Table:
