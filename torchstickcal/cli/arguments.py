@@ -160,6 +160,7 @@ def _add_calibrate_many(commands: Any) -> None:
     _add_config(command)
     _add_refining(command)
     _add_write(command, "each calibration and its points also")
+    add("--no-page", dest="page", action="store_false", help="do not write report.html for each session")
     _add_world(command)
     _add_units(command)
     _add_plugin(command)
