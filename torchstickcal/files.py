@@ -23,6 +23,8 @@ except ImportError:  # Windows
 
 CAMERAS_FILE, POINTS_FILE, REPORT_FILE, PAGE_FILE = "calibration.toml", "points.npz", "report.json", "report.html"
 """The files of a result: its cameras, the saved calibration, what programs and what people read of it."""
+RERUN_FILE = "scene.rrd"
+"""A recording for the Rerun viewer, of results for which it is asked."""
 
 _TEMPORARY = ".torchstickcal-"
 _CANNOT_SYNC = {errno.EINVAL, errno.ENOTSUP, errno.ENOSYS, errno.EBADF}

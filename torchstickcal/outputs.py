@@ -8,8 +8,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from torchstickcal.errors import CalibrationError
-from torchstickcal.files import PAGE_FILE, POINTS_FILE, REPORT_FILE, atomic_path, write_json
+from torchstickcal.files import PAGE_FILE, POINTS_FILE, REPORT_FILE, RERUN_FILE, atomic_path, write_json
 from torchstickcal.io.writers import CALIBRATION_WRITERS, Writer, writer_of
+from torchstickcal.show.rerun import rerun_package, write_rerun
 
 if TYPE_CHECKING:
     from torchstickcal.observations import Observations
@@ -26,11 +27,12 @@ class ResultFiles:
         formats: further formats, by their names as of :func:`torchstickcal.io.write_calibration`, or names of files that say
             their formats.
         page: whether ``report.html`` is written.
+        rerun: whether ``scene.rrd`` is written, for the Rerun viewer.
 
     Raises:
         ConfigError: for an unknown format.
-        CalibrationError: if a name of a file does not say its format or is one of another folder, or if two files have the
-            same name.
+        CalibrationError: if a name of a file does not say its format or is one of another folder, if two files have the same
+            name, or if the package that ``rerun`` needs is not installed.
 
     Example:
         >>> from torchstickcal import ResultFiles
@@ -40,10 +42,13 @@ class ResultFiles:
 
     formats: tuple[str, ...] = ()
     page: bool = True
+    rerun: bool = False
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "formats", tuple(self.formats))
         _ = self.writers
+        if self.rerun:
+            rerun_package()
 
     @property
     def writers(self) -> dict[str, Writer]:
@@ -53,7 +58,8 @@ class ResultFiles:
     @property
     def names(self) -> tuple[str, ...]:
         """The names of all files, and of the folders of formats of several files."""
-        return (*self.writers, POINTS_FILE, REPORT_FILE, *([PAGE_FILE] if self.page else []))
+        shown = [name for name, is_written in ((PAGE_FILE, self.page), (RERUN_FILE, self.rerun)) if is_written]
+        return (*self.writers, POINTS_FILE, REPORT_FILE, *shown)
 
     @property
     def single_files(self) -> list[str]:
@@ -80,11 +86,13 @@ class ResultFiles:
         write_json(folder / REPORT_FILE, made_of | calibration.summary())
         if self.page:
             write_page(folder / PAGE_FILE, calibration, made_of)
+        if self.rerun:
+            write_rerun(folder / RERUN_FILE, calibration)
 
 
 def result_writers(formats: Iterable[str], where: str) -> dict[str, Writer]:
     """The writers of the camera file and of further formats, by the names of their files; as :func:`named_writers`."""
-    return named_writers([CAMERAS_FORMAT, *formats], {POINTS_FILE, REPORT_FILE, PAGE_FILE}, where)
+    return named_writers([CAMERAS_FORMAT, *formats], {POINTS_FILE, REPORT_FILE, PAGE_FILE, RERUN_FILE}, where)
 
 
 def named_writers(names: Iterable[str], taken: set[str], where: str) -> dict[str, Writer]:

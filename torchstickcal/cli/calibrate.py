@@ -30,7 +30,7 @@ def calibrate_session(options: argparse.Namespace) -> int:
     from torchstickcal.pipeline.calibrate import calibrate
 
     config, refine = refining(load_config(options.config), options.refine, options.no_sync)
-    files, world = chosen_files(options.write), world_of(options.world, options.units)
+    files, world = chosen_files(options.write, rerun=options.rrd), world_of(options.world, options.units)
     initial = initial_of(options.initial)
     try_writing(options.out, files.single_files)
     if options.tensorboard is not None:

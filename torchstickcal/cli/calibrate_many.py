@@ -40,7 +40,7 @@ def calibrate_sessions(options: argparse.Namespace) -> int:
     config, refine = refining(load_config(options.config), options.refine, options.no_sync)
     memory_bytes, shard = _bytes(options.memory), _shard(options.shard)
     world_of(options.world, options.units)
-    files = chosen_files(options.write, options.page)
+    files = chosen_files(options.write, options.page, options.rrd)
     writing = _Writing(options.config, files, _with_whole_path(options.world), options.units)
     given = given_of(options)
     for name in ("intrinsics", "skeleton"):  # files, which processes elsewhere must find too

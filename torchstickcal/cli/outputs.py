@@ -22,22 +22,23 @@ if TYPE_CHECKING:
 EXIT_DONE, EXIT_NOT_CONVERGED, EXIT_UNUSABLE, EXIT_POOR, EXIT_INTERRUPTED = 0, 1, 2, 3, 130
 
 
-def chosen_files(formats: str | None = None, page: bool = True) -> ResultFiles:
+def chosen_files(formats: str | None = None, page: bool = True, rerun: bool = False) -> ResultFiles:
     """The files of a result that options ask for.
 
     Args:
         formats: further formats, or files whose names say their formats, with commas.
         page: whether ``report.html`` is written.
+        rerun: whether ``scene.rrd`` is written.
 
     Raises:
         ConfigError: for an unknown format.
-        CalibrationError: if two files have the same name.
+        CalibrationError: if two files have the same name, or if Rerun is not installed.
     """
     from torchstickcal.outputs import ResultFiles, result_writers
 
     named = tuple(formats.split(",")) if formats else ()
     result_writers(named, "--write")
-    return ResultFiles(named, page)
+    return ResultFiles(named, page, rerun)
 
 
 def point_writers(names: str | None) -> dict[str, Writer]:

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from torchstickcal.cli.outputs import EXIT_DONE
-from torchstickcal.files import PAGE_FILE, POINTS_FILE, REPORT_FILE
+from torchstickcal.files import PAGE_FILE, POINTS_FILE, REPORT_FILE, RERUN_FILE
 
 if TYPE_CHECKING:
     from torchstickcal.result import Calibration
@@ -18,12 +18,18 @@ def report(options: argparse.Namespace) -> int:
     from torchstickcal.files import try_writing
     from torchstickcal.outputs import write_page
     from torchstickcal.result import Calibration
+    from torchstickcal.show.rerun import rerun_package, write_rerun
 
     folder: Path = options.folder
+    if options.rrd:
+        rerun_package()
     calibration = Calibration.load(folder / POINTS_FILE)
-    try_writing(folder, [PAGE_FILE], where="report")
+    try_writing(folder, [PAGE_FILE, *([RERUN_FILE] if options.rrd else [])], where="report")
     write_page(folder / PAGE_FILE, calibration, _made_of(folder / REPORT_FILE, calibration))
     print(f"{folder / PAGE_FILE}: open it in a browser")
+    if options.rrd:
+        write_rerun(folder / RERUN_FILE, calibration)
+        print(f"{folder / RERUN_FILE}: open it with the command `rerun`")
     return EXIT_DONE
 
 
