@@ -13,6 +13,7 @@ from torchstickcal.cli.outputs import (
     print_errors,
     show_results,
 )
+from torchstickcal.cli.world import placed, world_of
 
 
 def simulate(options: argparse.Namespace) -> int:
@@ -49,7 +50,7 @@ def demo(options: argparse.Namespace) -> int:
         "A golf swing seen by 6 cameras: 240 frames, 1.5 px noise, 15 % of the keypoints missing, 5 % wrong by up to 150 px.\n"
     )
     observations, truth = golf_session(noise=Noise(sigma_px=1.5, missing=0.15, outliers=0.05), seed=options.seed)
-    calibration = calibrate(observations, callback=Progress(None))
+    calibration, _ = placed(calibrate(observations, callback=Progress(None)), world_of("athlete"))
     with atomic_set(options.out) as folder:
         write_npz(folder / "session.npz", observations, truth)
         files(calibration, folder, {"session": str(options.out / "session.npz"), "config": "default"})
