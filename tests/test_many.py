@@ -30,6 +30,7 @@ from torchstickcal import (
     load_config,
 )
 from torchstickcal.cli import main
+from torchstickcal.cli.arguments import parser
 from torchstickcal.cli.calibrate_many import _Writing
 from torchstickcal.io import Given, write_npz
 from torchstickcal.many import SessionFile, SessionRow, read_manifests, session_files
@@ -190,19 +191,22 @@ def test_failures_are_rows_and_are_tried_again_only_if_that_is_asked_for(tmp_pat
 
 def test_many_sessions_have_the_files_of_one(tmp_path: Path):
     write_npz(tmp_path / "swing.npz", swing(0))
-    one, many = tmp_path / "one", tmp_path / "many" / "results" / "swing.npz"
-    options = [str(tmp_path / "swing.npz"), "--write", "trc,camera_array.toml"]
-    assert main(["calibrate", *options, "--out", str(one)]) == 0
-    (tmp_path / "sessions").mkdir()
-    options[0] = str(tmp_path / "sessions")
-    (tmp_path / "swing.npz").rename(tmp_path / "sessions" / "swing.npz")
-    assert main(["calibrate-many", *options, "--out", str(tmp_path / "many"), "--jobs", "1"]) == 0
-    assert {path.name for path in many.iterdir()} == {path.name for path in one.iterdir()}
-    assert (many / "calibration.toml").read_bytes() == (one / "calibration.toml").read_bytes()
-    assert main(["calibrate-many", *options, "--out", str(tmp_path / "bare"), "--jobs", "1", "--no-page"]) == 0
-    bare = {path.name for path in (tmp_path / "bare" / "results" / "swing.npz").iterdir()}
-    assert bare == {path.name for path in one.iterdir()} - {"report.html"}
-    assert "results/swing.npz/report.json" in (tmp_path / "bare" / "index.html").read_text()
+    one = tmp_path / "one"
+    assert main(["calibrate", str(tmp_path / "swing.npz"), "--write", "trc,camera_array.toml", "--out", str(one)]) == 0
+    expected = {path.name for path in one.iterdir()}
+    assert {"report.html", "points.trc", "camera_array.toml"} <= expected
+    with ThreadPoolExecutor(1) as pool:
+        for page, linked in ((True, "report.html"), (False, "report.json")):
+            out, files = tmp_path / f"page {page}", ResultFiles(("trc", "camera_array.toml"), page=page)
+            calibrate_many({"swing": swing(0)}, refine="auto", executor=pool, out=out, write=files)
+            assert {path.name for path in (out / "results" / "swing").iterdir()} == expected - {"report.html"} | {linked}
+            assert f"results/swing/{linked}" in (out / "index.html").read_text()
+
+
+def test_the_command_can_leave_the_page_out():
+    command = ["calibrate-many", "sessions", "--out", "results"]
+    assert parser().parse_args(command).page
+    assert not parser().parse_args([*command, "--no-page"]).page
 
 
 @pytest.mark.parametrize(
