@@ -97,6 +97,7 @@ VALUES: dict[str, list[str] | None] = {
     "--shard": ["1/2", "3/2", "x", ""],
     "--memory": ["8GB", "1", "x", ""],
     "--retry": None,
+    "--no-page": None,
 }
 """The values that are tried of each option, words separated by blanks; None for an option without one. What would take long is
 left out."""
