@@ -250,7 +250,7 @@ def test_an_unexpected_error_is_one_line_and_its_traceback_on_request(
 
     monkeypatch.setattr("torchstickcal.metrics.pose_errors", broken)
     assert main(["evaluate", str(session), str(session)]) == 2
-    assert capsys.readouterr().err.startswith("error: unexpected RuntimeError: two lines (TORCHSTICKCAL_TRACEBACK=1")
+    assert capsys.readouterr().err.startswith("error: unexpected RuntimeError: two lines (--debug shows where)")
     monkeypatch.setenv("TORCHSTICKCAL_TRACEBACK", "1")
     assert main(["evaluate", str(session), str(session)]) == 2
     assert "in broken" in capsys.readouterr().err

@@ -8,8 +8,11 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from torchstickcal.cli.configuration import chosen_config
+from torchstickcal.cli.console import note
 from torchstickcal.cli.outputs import EXIT_DONE, EXIT_NOT_CONVERGED, try_json, write_json
 from torchstickcal.cli.plugins import import_plugins
+from torchstickcal.cli.progress import progress
 from torchstickcal.errors import CalibrationError
 
 if TYPE_CHECKING:
@@ -23,21 +26,22 @@ def benchmark(options: argparse.Namespace) -> int:
 def _score(options: argparse.Namespace) -> int:
     """The errors of one configuration."""
     from torchstickcal.benchmark import score_sequence, sources, summarise
-    from torchstickcal.config import load_config
 
-    config = load_config(options.config)
+    config = chosen_config(options)
     try_json(options.json)
     cases = sources(options.place, options.count)
     width = max(len(case.name) for case in cases)
     scores = []
     print(f"{'session':{width}}  rotation (deg)  translation (mm)  time (ms)  status")
-    for case in cases:
-        score = score_sequence(case, config)
-        if score is None:
-            print(f"{case.name} skipped: it holds no truth", file=sys.stderr)
-            continue
-        scores.append(score)
-        print(_score_line(score, width), flush=True)
+    with progress(options) as bar:
+        for number, case in enumerate(cases):
+            bar(number, len(cases), f"session {number + 1} of {len(cases)}: {case.name}")
+            score = score_sequence(case, config)
+            if score is None:
+                note(f"{case.name} is left out, because it holds no truth.")
+                continue
+            scores.append(score)
+            print(_score_line(score, width), flush=True)
     summary = summarise(scores)
     if summary["mean_rotation_deg"] is not None:
         mean = f"{summary['mean_rotation_deg']:14.5f}  {1000 * summary['mean_translation_m']:16.3f}"
@@ -63,7 +67,8 @@ def _measure(options: argparse.Namespace) -> int:
     cases = sources(options.place, options.count)
     try_writing(options.out, FILES)
     prepare = partial(import_plugins, options.plugin)
-    rows = run_benchmark(Path(options.place).name, cases, names, options.out, options.jobs, _progress_bar, prepare)
+    with progress(options) as bar:
+        rows = run_benchmark(Path(options.place).name, cases, names, options.out, options.jobs, bar, prepare)
     if not rows:
         raise CalibrationError("no session with truth", where="benchmark", got=options.place, expected="sessions with truth")
     write_results(rows, options.out)
@@ -71,12 +76,3 @@ def _measure(options: argparse.Namespace) -> int:
         print(f"{failed} of {len(rows)} measurements failed; the table of failures says why", file=sys.stderr)
     print(f"{len(rows)} measurements, tables and figures in {options.out}")
     return EXIT_DONE
-
-
-def _progress_bar(done: int, total: int, what: str) -> None:
-    """A bar in a terminal; elsewhere a line after each tenth of the measurements."""
-    if sys.stderr.isatty():
-        bar = "#" * (30 * done // total)
-        print(f"\r[{bar:<30}] {done}/{total} {what:<60.60}", end="\n" if done == total else "", file=sys.stderr, flush=True)
-    elif 10 * done // total > 10 * (done - 1) // total:
-        print(f"{done}/{total} measured", file=sys.stderr, flush=True)

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import argparse
-import sys
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 from torchstickcal.cli.calibrate import given_of
+from torchstickcal.cli.console import note
 from torchstickcal.cli.outputs import EXIT_DONE, try_json, write_json
 
 if TYPE_CHECKING:
@@ -23,8 +23,8 @@ def info(options: argparse.Namespace) -> int:
     try_json(options.json)
     given = given_of(options)
     session = load_session(options.session, options.format, replace(given, stick=given.stick or []))
-    for note in session.notes:
-        print(f"note: {note}", file=sys.stderr)
+    for sentence in session.notes:
+        note(sentence)
     found = _found(session.observations)
     print(_table(found))
     write_json(options.json, found | {"notes": list(session.notes)})

@@ -1,0 +1,82 @@
+"""The configuration that the options of a command give."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any, Protocol
+
+from torchstickcal.cli.outputs import EXIT_DONE
+from torchstickcal.errors import CalibrationError
+
+if TYPE_CHECKING:
+    from torchstickcal.config import Config
+
+
+def print_config(options: argparse.Namespace) -> int:
+    """Show the whole configuration of a command, as a file that ``--config`` takes."""
+    from torchstickcal.config import config_toml
+
+    print(config_toml(options.configuration(options)), end="")
+    return EXIT_DONE
+
+
+def chosen_config(options: argparse.Namespace) -> Config:
+    """The configuration of ``--config``, with what ``--set`` sets.
+
+    Raises:
+        ConfigError: if there is none such.
+    """
+    from torchstickcal.config import load_config, with_settings
+
+    return with_settings(load_config(options.config), options.set)
+
+
+def triangulation_config(options: argparse.Namespace) -> Config:
+    """The configuration of :func:`chosen_config`, without clocks if the cameras are synchronised."""
+    config = chosen_config(options)
+    return replace(config, synchronise=False) if options.no_sync else config
+
+
+def calibration_config(options: argparse.Namespace) -> Config:
+    """The configuration of :func:`triangulation_config`, with what ``--refine`` says; what the keypoints contradict is refined
+    where neither says anything.
+
+    Raises:
+        ConfigError: also for an unknown name.
+        CalibrationError: if clocks are to be refined although the cameras are synchronised.
+    """
+    from torchstickcal.config import with_refine
+    from torchstickcal.model.unknowns import REFINEMENTS, clock_refinements
+
+    config = triangulation_config(options)
+    refine: Any = options.refine
+    if refine is None:
+        return config if config.refine else with_refine(config, "auto")
+    if refine != "auto":
+        refine = [] if refine == "none" else refine.split(",")
+        for name in refine:
+            REFINEMENTS[name]  # raises for an unknown name
+    if options.no_sync and clock_refinements() & set(refine):
+        raise CalibrationError(
+            "clocks cannot be refined if the cameras are synchronised",
+            where="--no-sync",
+            got=f"--refine {options.refine}",
+            expected="one of the two",
+        )
+    return with_refine(config, refine)
+
+
+class Chosen(Protocol):
+    """Which configuration was chosen, and what was set of it."""
+
+    @property
+    def config(self) -> str: ...
+    @property
+    def set(self) -> Sequence[str]: ...
+
+
+def made_with(chosen: Chosen) -> dict[str, Any]:
+    """The same, as JSON can hold it."""
+    return {"config": chosen.config} | ({"set": list(chosen.set)} if chosen.set else {})
