@@ -27,6 +27,7 @@ from torchstickcal.untrusted import read_bytes
 
 _EXTENDS = "extends"
 _SET = "--set"
+_HEIGHTS_M = 0.5, 2.5
 
 Refine = Annotated[str, REFINEMENTS]
 """A name in :data:`torchstickcal.model.unknowns.REFINEMENTS`."""
@@ -127,6 +128,7 @@ class Config:
         incomplete: what to do with cameras that share too little to be one rig: ``refuse`` them, or calibrate the ``largest``
             part of them alone and name the others.
         scale: a length between points that sets the scale instead of the sticks.
+        height_m: body height of the athlete, metres, which sets the scale where neither ``scale`` nor a stick does.
         refine: what else is estimated of the cameras, in every stage that estimates them; ``auto`` for what the keypoints
             contradict.
         camera_groups: a label for each camera; cameras with the same label share what is shared. Empty: all cameras do.
@@ -154,12 +156,24 @@ class Config:
     relabel: bool = False
     incomplete: Literal["refuse", "largest"] = "refuse"
     scale: ScaleSettings | None = None
+    height_m: Positive | None = None
     refine: list[Refine] | Literal["auto"] = field(default_factory=list)
     camera_groups: list[str] = field(default_factory=list)
     synchronise: bool = True
     max_offset_s: Positive = 2.0
     noise: Literal["estimated", "given"] = "estimated"
     sigma_px: Positive | list[Positive] = 1.0
+
+    def __post_init__(self) -> None:
+        least, most = _HEIGHTS_M
+        if self.height_m is not None and not least <= self.height_m <= most:
+            raise ConfigError(
+                "not the height of a person",
+                where="height_m",
+                got=self.height_m,
+                expected=f"{least:g} to {most:g}",
+                remedy="Give it in metres.",
+            )
 
     @property
     def given_sigma_px(self) -> Tensor | None:

@@ -510,6 +510,12 @@ def _add_refining(command: argparse.ArgumentParser) -> None:
     )
     _add_no_sync(command)
     command.add_argument(
+        "--height",
+        metavar="M",
+        type=float,
+        help="body height of the athlete in metres, which sets the scale, to about 3 %%, where there is no stick",
+    )
+    command.add_argument(
         "--stick-length", metavar="M", type=float, help="length of the stick in metres (default: the session's)"
     )
     command.add_argument(

@@ -113,7 +113,7 @@ def _provenance(options: argparse.Namespace, config: Config, notes: Sequence[str
 
     return {
         "session": ", ".join(map(str, options.session)),
-        **made_with(options),
+        **made_with(options.config, options.set),
         "configuration": asdict(config),
         **({"notes": list(notes)} if notes else {}),
     }

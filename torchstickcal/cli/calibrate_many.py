@@ -115,7 +115,7 @@ class _Writing:
 
     def __call__(self, calibration: Calibration, folder: Path, provenance: dict[str, Any]) -> None:
         calibration, sentences = placed(calibration, world_of(self.world, self.units))
-        provenance = provenance | made_with(self)
+        provenance = provenance | made_with(self.config, self.set)
         if notes := [*provenance.get("notes", ()), *sentences]:
             provenance["notes"] = notes
         write_results(calibration, folder, chosen_writers(self.write), provenance)

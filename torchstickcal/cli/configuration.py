@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 from torchstickcal.cli.outputs import EXIT_DONE
 from torchstickcal.errors import CalibrationError
@@ -40,8 +40,8 @@ def triangulation_config(options: argparse.Namespace) -> Config:
 
 
 def calibration_config(options: argparse.Namespace) -> Config:
-    """The configuration of :func:`triangulation_config`, with what ``--refine`` says; what the keypoints contradict is refined
-    where neither says anything.
+    """The configuration of :func:`triangulation_config`, with what ``--refine`` and ``--height`` say; what the keypoints contradict
+    is refined where nothing is said.
 
     Raises:
         ConfigError: also for an unknown name.
@@ -51,6 +51,8 @@ def calibration_config(options: argparse.Namespace) -> Config:
     from torchstickcal.model.unknowns import REFINEMENTS, clock_refinements
 
     config = triangulation_config(options)
+    if options.height is not None:
+        config = replace(config, height_m=options.height, scale=None)
     refine: Any = options.refine
     if refine is None:
         return config if config.refine else with_refine(config, "auto")
@@ -68,15 +70,6 @@ def calibration_config(options: argparse.Namespace) -> Config:
     return with_refine(config, refine)
 
 
-class Chosen(Protocol):
-    """Which configuration was chosen, and what was set of it."""
-
-    @property
-    def config(self) -> str: ...
-    @property
-    def set(self) -> Sequence[str]: ...
-
-
-def made_with(chosen: Chosen) -> dict[str, Any]:
-    """The same, as JSON can hold it."""
-    return {"config": chosen.config} | ({"set": list(chosen.set)} if chosen.set else {})
+def made_with(config: str, settings: Sequence[str]) -> dict[str, Any]:
+    """The name of a configuration and what was set of it, as JSON can hold them."""
+    return {"config": config} | ({"set": list(settings)} if settings else {})

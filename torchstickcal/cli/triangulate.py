@@ -53,6 +53,6 @@ def _provenance(options: argparse.Namespace, notes: list[str]) -> dict[str, Any]
     return {
         "session": ", ".join(map(str, options.session)),
         "calibration": str(options.calibration),
-        **made_with(options),
+        **made_with(options.config, options.set),
         **({"notes": notes} if notes else {}),
     }

@@ -79,7 +79,9 @@ def _scale(evidence: Evidence) -> Iterator[Finding]:
             "scale_imprecise",
             Severity.SERIOUS if unknown else Severity.CAUTION,
             f"The scale has a standard deviation of {std:.1%}: all distances are uncertain by this share.",
-            "Measure the stick's length better (Stick.sigma_m), and record it for longer and closer to the cameras.",
+            "Measure the stick's length better (Stick.sigma_m), and record it for longer and closer to the cameras."
+            if len(kept.sticks)
+            else "Record a stick of known length: nothing else gives a scale that is better than a few per cent.",
             figure=std,
             limit=_UNKNOWN_SCALE if unknown else _IMPRECISE_SCALE,
             unit="share",
