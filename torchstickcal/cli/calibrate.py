@@ -50,7 +50,7 @@ def calibrate_session(options: argparse.Namespace) -> int:
         calibration, sentences = placed(calibration, world)
         with atomic_set(options.out) as folder:
             write_results(calibration, folder, writers, _provenance(options, config, [*session.notes, *sentences]))
-    for sentence in sentences:
+    for sentence in [*sentences, *(f.meaning for f in calibration.quality.findings if f.code == "height_unused")]:
         note(sentence)
     return show_results(calibration, options.out, writers, options.strict, options.verbose)
 

@@ -40,8 +40,8 @@ def triangulation_config(options: argparse.Namespace) -> Config:
 
 
 def calibration_config(options: argparse.Namespace) -> Config:
-    """The configuration of :func:`triangulation_config`, with what ``--refine`` and ``--height`` say; what the keypoints contradict
-    is refined where nothing is said.
+    """The configuration of :func:`triangulation_config`, with what ``--height`` and ``--refine`` say; what the keypoints
+    contradict is refined where nothing is said.
 
     Raises:
         ConfigError: also for an unknown name.

@@ -1,8 +1,8 @@
 """Parts of the body whose lengths follow from the body height.
 
-A body that bends and walks is never as long as it is tall, but its bones keep their lengths. So the height is compared with the
-lengths of shanks, thighs and trunk, and of neck and head where the top of the head is known. The lengths are those of an average
-adult, as shares of the height (Winter, Biomechanics and Motor Control of Human Movement, after Drillis and Contini).
+A body that bends and walks is never as long as it is tall, but its bones keep their lengths. So the height is compared with
+the lengths of shanks, thighs and trunk, and of neck and head where the top of the head is known. The lengths are those of an
+average adult, as shares of the height (Winter, Biomechanics and Motor Control of Human Movement, after Drillis and Contini).
 """
 
 from __future__ import annotations
@@ -11,17 +11,44 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 from torchstickcal.errors import ObservationError
-from torchstickcal.skeletons import conventional
+from torchstickcal.skeletons import conventional, point_named
 
 HEIGHT_STD = 0.03
-"""Standard deviation of the scale that a height gives, as a share of it: people differ from the average by about 2 %, and what a
-detector calls a joint is not exactly where it is."""
+"""Standard deviation of the scale that a height gives, as a share of it: people differ from the average by about 2 %, and what
+a detector calls a joint is not exactly where it is."""
 
-_HEAD = {"head_top": 1.0, "head": 0.99, "left_eye": 0.936, "right_eye": 0.936, "left_ear": 0.93, "right_ear": 0.93, "nose": 0.915}
-"""How high points of the head are when a body stands upright."""
+_HEAD = {"head_top": 1.0} | {
+    f"{side}_{point}": share for point, share in (("ear", 0.93), ("eye", 0.936)) for side in ("left", "right")
+}
+_HEAD |= {"nose": 0.915, "head": 0.95}
 _FEET = {"ankle": 0.039, "heel": 0.02}
+"""How high points of the head and of the feet are when a body stands upright."""
+BETWEEN_HEAD_AND_ANKLES = 0.961
+"""From the ankles to the top of the head, as a share of the height."""
 _SHANK, _THIGH, _THIGH_FROM_MIDDLE, _TRUNK, _NECK_AND_HEAD = 0.246, 0.245, 0.25, 0.288, 0.182
 _SHANK_TO_HEEL = 0.267
+
+
+def standing_in(name: str, point_names: Sequence[str] | None) -> tuple[str, float]:
+    """A point of the head or of a foot that takes the place of one that a skeleton lacks, and by how much it is higher, as a
+    share of the body height; the point itself where it is there, or where nothing can take its place.
+
+    Example:
+        >>> standing_in("head_top", ["nose", "left_ankle"])
+        ('nose', -0.085)
+    """
+    given = {conventional(other): other for other in reversed(point_names or ())}
+    wanted = conventional(name)
+    side, _, joint = wanted.partition("_")
+    heights = _HEAD if wanted in _HEAD else {}
+    if joint in _FEET:
+        heights = {f"{side}_{other}": height for other, height in _FEET.items()}
+    if wanted in given or not heights:
+        return point_named(name, point_names or ()), 0.0
+    for other, height in heights.items():
+        if other in given:
+            return given[other], round(height - heights[wanted], 6)
+    return name, 0.0
 
 
 class Segment(NamedTuple):
@@ -61,11 +88,10 @@ def segments_of(point_names: Sequence[str] | None) -> list[Segment]:
     add(shoulders, middle, _TRUNK, times=2)  # twice, as there are two legs: then a hip that is too high or too low does no harm
     add(found("head_top") or (found("head") if "nose" in index else ()), shoulders, _NECK_AND_HEAD, times=2)
     if not segments:
-        head = next(((name, found(name)) for name in _HEAD if name in index), ("", ()))
-        foot, feet = next(
-            ((joint, points) for joint in _FEET if (points := found(f"left_{joint}", f"right_{joint}"))), ("ankle", ())
-        )
-        add(head[1], feet, _HEAD.get(head[0], 1.0) - _FEET[foot], rigid=False)
+        heads = [name for name in _HEAD if name in index]
+        feet = [joint for joint in _FEET if found(f"left_{joint}", f"right_{joint}")]
+        for head, joint in zip(heads[:1], feet[:1], strict=False):
+            add(found(head), found(f"left_{joint}", f"right_{joint}"), _HEAD[head] - _FEET[joint], rigid=False)
     if not segments:
         raise ObservationError(
             "the body height says nothing of these points",
