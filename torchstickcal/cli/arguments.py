@@ -355,6 +355,15 @@ def _add_benchmark(commands: Any) -> None:
         help="with --out: names from `torchstickcal list configs` and `torchstickcal list baselines` (default: all)",
     )
     command.add_argument("--jobs", metavar="N", type=int, default=1, help="with --out: number of processes (default: 1)")
+    command.add_argument(
+        "--external",
+        metavar="NAME=FOLDER",
+        action="append",
+        default=[],
+        help="also measure poses that were computed elsewhere: a folder with a calibration for each session, called after the "
+        "session, of any format; where its unit is not known, its size is fitted to the truth; may be given several times",
+    )
+    _add_units(command)
     _add_plugin(command)
     command.set_defaults(run=benchmark, configuration=chosen_config)
 
