@@ -14,6 +14,7 @@ from torchstickcal.cli.outputs import (
     write_results,
 )
 from torchstickcal.cli.progress import StagesProgress, progress, weights_of
+from torchstickcal.cli.world import placed, world_of
 
 
 def simulate(options: argparse.Namespace) -> int:
@@ -52,6 +53,7 @@ def demo(options: argparse.Namespace) -> int:
     observations, truth = golf_session(noise=Noise(sigma_px=1.5, missing=0.15, outliers=0.05), seed=options.seed)
     with progress(options) as bar:
         calibration = calibrate(observations, callback=StagesProgress(bar, weights_of(load_config())))
+    calibration, _ = placed(calibration, world_of("athlete"))
     with atomic_set(options.out) as folder:
         write_npz(folder / "session.npz", observations, truth)
         write_results(calibration, folder, writers, {"session": str(options.out / "session.npz"), "config": "default"})
