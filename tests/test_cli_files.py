@@ -101,10 +101,9 @@ def test_info_says_what_accuracy_to_expect(sample: Path, results: Path, tmp_path
     command = ["info", str(sample), "--skeleton", str(sample / "skeleton.toml"), "--json", str(tmp_path / "i.json")]
     assert main([*command, *STICK]) == 0
     expected = json.loads((tmp_path / "i.json").read_text())["expected"]
-    assert (
-        f"Expected accuracy: standard deviation of the camera positions {1000 * expected['position_std_m']:.2g} mm, by 60 of 90 frames"
-        in (capsys.readouterr().out)
-    )
+    std_mm = f"{1000 * expected['position_std_m']:.2g} mm"
+    said = f"Expected accuracy: standard deviation of the camera positions {std_mm}, by 60 of 90 frames"
+    assert said in capsys.readouterr().out
     reached = float(Calibration.load(results / "points.npz").camera_std_m[1:].mean())
     assert 0.5 * expected["position_std_m"] < reached < expected["position_std_m"]
     assert main(command) == 0
