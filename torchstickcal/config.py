@@ -238,7 +238,7 @@ def config_toml(config: Config) -> str:
     """A configuration with all its keys as TOML, from which :func:`load_config` reads an equal one.
 
     Example:
-        >>> print(config_toml(load_config("paper"))[:59])
+        >>> print(config_toml(load_config("paper"))[:60])
         points = "all"
         solver = "gauss_newton"
         precision = "float64"
