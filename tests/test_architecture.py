@@ -33,7 +33,7 @@ FLOORS = [
     ["result", "reconstruction"],
     ["io"],
     ["pipeline.noise"],
-    ["pipeline.run", "pipeline.scale"],
+    ["pipeline.run", "pipeline.height", "pipeline.scale"],
     ["pipeline.stage"],
     ["pipeline.settle"],
     ["pipeline.initialise", "pipeline.synchronise"],

@@ -3,38 +3,12 @@
 from __future__ import annotations
 
 import argparse
-from pathlib import Path
-from typing import Any
 
 from torchstickcal.cli.outputs import EXIT_DONE
 from torchstickcal.errors import CalibrationError
 from torchstickcal.files import POINTS_FILE
 
 PICTURES = ("curves.png", "repeated.png")
-
-
-def add_analyse(commands: Any) -> None:
-    command = commands.add_parser(
-        "analyse",
-        help="joint angles, stick kinematics and phases of the swings of a calibrated session",
-        description="Joint angles, stick kinematics, phases and repeated swings of a calibrated session, with their "
-        "standard deviations.",
-    )
-    add = command.add_argument
-    add("calibration", metavar="DIR", type=Path, help=f"folder that `calibrate` wrote, or its {POINTS_FILE}")
-    add("--out", metavar="DIR", type=Path, help="folder for tables and pictures (default: `analysis` in DIR)")
-    add("--sport", default="any", help="golf, baseball, hockey, kendo or any: whose rule for the impact is used (default: any)")
-    add("--fps", metavar="HZ", type=float, help="frames per second (default: the session's)")
-    add(
-        "--up",
-        metavar=("X", "Y", "Z"),
-        nargs=3,
-        type=float,
-        help="the vertical in the frame of the first camera (default: from the cameras, if they stand level)",
-    )
-    add("--stick", metavar="N", type=int, default=0, help="which stick, counted from 0 (default: 0)")
-    add("--plugin", action="append", default=[], help=argparse.SUPPRESS)
-    command.set_defaults(run=analyse_session)
 
 
 def analyse_session(options: argparse.Namespace) -> int:

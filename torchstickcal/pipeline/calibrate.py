@@ -17,6 +17,7 @@ from torchstickcal.pipeline.adjust import adjust_points
 from torchstickcal.pipeline.check import CameraCheck
 from torchstickcal.pipeline.conclude import conclude
 from torchstickcal.pipeline.run import Run
+from torchstickcal.pipeline.scale import ending_in_scale
 from torchstickcal.pipeline.selection import ModelSelection
 from torchstickcal.pipeline.start import Poses, starting_from
 from torchstickcal.result import Calibration
@@ -123,6 +124,7 @@ def _calibrated(
     began = time.perf_counter()
     if (on_start := getattr(callback, "on_start", None)) is not None:
         on_start(observations)
+    config = ending_in_scale(config, len(observations.sticks))
     run = Run(config, callback.on_iteration if callback else ignore_record)
     models = ModelSelection(observations, run, start)
 
