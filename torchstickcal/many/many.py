@@ -141,14 +141,15 @@ def calibrate_many(
         plan = _Plan(sources, settings, prepare, earlier)
         count = jobs if total is None else max(1, min(jobs, total))
         done = on_executor(plan.tasks(), executor) if executor else on_processes(plan.tasks(), count, memory_bytes, prepare)
-        for row, calibration in stack.enter_context(closing(done)):
+        for together in stack.enter_context(closing(done)):
             if manifest is not None:
-                manifest.append(row)
-            if calibration is not None:
-                calibrations[row.name] = calibration
-            found[row.name] = row
-            if progress:
-                progress(plan.done_earlier + len(found), total, row)
+                manifest.append([row for row, _ in together])
+            for row, calibration in together:
+                if calibration is not None:
+                    calibrations[row.name] = calibration
+                found[row.name] = row
+                if progress:
+                    progress(plan.done_earlier + len(found), total, row)
     if folder is not None:
         write_tables(folder)
     rows = earlier | found
