@@ -109,15 +109,19 @@ def perform(tasks: Sequence[Task]) -> Performed:
     for task in tasks:
         loaded = _loaded(task)
         if isinstance(loaded, _Loaded):
-            if not sessions and len(tasks) > 1 and loaded.together == 1 and not taken:
-                return Performed([], together=1)
-            if taken and not _fit_together([*sessions, loaded]):
+            if len(tasks) > 1 and loaded.together == 1:
+                return Performed(_rows(taken), together=1)
+            if sessions and not _fit_together([*sessions, loaded]):
                 break
             sessions.append(loaded)
         taken.append(loaded)
-    done = iter(_calibrated(sessions))
-    rows = [next(done) if isinstance(one, _Loaded) else one for one in taken]
-    return Performed(rows, min((one.together for one in sessions), default=None))
+    return Performed(_rows(taken), min((one.together for one in taken if isinstance(one, _Loaded)), default=None))
+
+
+def _rows(taken: Sequence[_Loaded | Done]) -> list[Done]:
+    """What becomes of sessions that fit together, or of one, and of those that could not be read."""
+    calibrated = iter(_calibrated([one for one in taken if isinstance(one, _Loaded)]))
+    return [next(calibrated) if isinstance(one, _Loaded) else one for one in taken]
 
 
 def failed_row(task: Task, error: str, seconds: float = 0.0) -> SessionRow:

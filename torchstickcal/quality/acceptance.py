@@ -157,26 +157,35 @@ def _shifts_without_folds(part: Adjustment, kept: Measurements) -> list[tuple[sl
     information, gradient = system.reduced[0], system.reduced_gradient[0]
     everything = solve_information(information, gradient)
     bounds = [kept.frames * number // _FOLDS for number in range(_FOLDS + 1)]
+    windows = [slice(start, stop) for start, stop in itertools.pairwise(bounds) if stop > start]
     found: list[tuple[slice, Tensor]] = []
-    for start, stop in itertools.pairwise(bounds):
-        if stop == start:
-            continue
-        window = slice(start, stop)
-        columns = kept.columns_of(window)
-        own = State(state.rotations, state.translations, state.points[..., columns], state.unknowns)
-        fold = NormalEquations(Objective(kept.within(window), objective.losses), own, cameras_free=True)
-        left = solve_information(information - _without_prior(fold), gradient - fold.reduced_gradient[0])
-        found.append((window, everything - left))
+    for _, alike in itertools.groupby(sorted(windows, key=_length), _length):
+        together = list(alike)
+        for window, own in zip(together, _shares(objective, state, together), strict=True):
+            left = solve_information(information - own[0], gradient - own[1])
+            found.append((window, everything - left))
     return found
 
 
-def _without_prior(fold: NormalEquations) -> Tensor:
-    """A fold's share of the reduced system: the prior of the unknowns belongs to the session."""
-    information = fold.reduced[0].clone()
-    _, _, prior = fold.objective.linearise_prior(fold.state)
-    poses = len(information) - prior.shape[1]
-    information.diagonal()[poses:] -= prior[0]
-    return information
+def _length(window: slice) -> int:
+    return window.stop - window.start
+
+
+def _shares(objective: Objective, state: State, windows: list[slice]) -> list[tuple[Tensor, Tensor]]:
+    """What windows of equal length contribute to the reduced system and its gradient, worked out as sessions side by side.
+
+    The prior of the unknowns is no part of it: it belongs to the session.
+    """
+    kept = objective.measurements
+    points = torch.cat([state.points[..., kept.columns_of(window)] for window in windows])
+    rotations, translations = (t.expand(len(windows), *t.shape[1:]) for t in (state.rotations, state.translations))
+    own = State(rotations, translations, points, state.unknowns.expand(len(windows), -1))
+    parts = Measurements.stack([kept.within(window) for window in windows])
+    folds = NormalEquations(Objective(parts, objective.losses), own, cameras_free=True)
+    _, _, prior = folds.objective.linearise_prior(own)
+    information = folds.reduced.clone()
+    information.diagonal(dim1=1, dim2=2)[:, information.shape[1] - prior.shape[1] :] -= prior
+    return list(zip(information, folds.reduced_gradient, strict=True))
 
 
 def _only(kept: Measurements, points: Tensor) -> Measurements:
