@@ -9,6 +9,7 @@ frames.
 from __future__ import annotations
 
 import itertools
+from dataclasses import replace
 from typing import NamedTuple
 
 import torch
@@ -112,14 +113,13 @@ def _predicted(part: Adjustment, kept: Measurements, noise: Tensor, ruler: Tenso
     if not len(kept.sticks) or not bool(kept.stick_active.any()):
         return None
     shifts = _shifts_without_folds(part, kept)
-    ends = _only(kept, kept.sticks.flatten().unique())
-    state, step = part.state, torch.zeros_like(part.state.points)
-    loss = ReprojectionLoss(part.last.sigma_px[:, None, None])
+    chosen = kept.sticks.flatten().unique()
+    ends, state = _only(kept, part.state, chosen)
+    loss = ReprojectionLoss(part.last.sigma_px[:, None, None, chosen])
     system = NormalEquations(Objective(ends, {"reprojection": loss}), state, cameras_free=True)
     for _ in range(_TRIANGULATIONS):
         held = NormalEquations(Objective(ends, {"reprojection": loss}), state, cameras_free=False)
-        step = held.step().points
-        state = State(state.rotations, state.translations, state.points + step, state.unknowns)
+        state = replace(state, points=state.points + held.step().points)
     response = ends.by_frame(system.point_response()[0])
     points = ends.by_frame(state.points[0]).clone()
     for frames, shift in shifts:
@@ -188,11 +188,19 @@ def _shares(objective: Objective, state: State, windows: list[slice]) -> list[tu
     return list(zip(information, folds.reduced_gradient, strict=True))
 
 
-def _only(kept: Measurements, points: Tensor) -> Measurements:
-    """The measurements of some points alone."""
-    chosen = torch.zeros(kept.points_per_frame, dtype=torch.bool, device=kept.pixels.device)
-    chosen[points] = True
-    return kept.keeping(chosen.repeat(kept.frames))
+def _only(kept: Measurements, state: State, points: Tensor) -> tuple[Measurements, State]:
+    """The measurements and the state of some points alone, among which all ends of sticks are."""
+    first = torch.arange(0, kept.num_columns, kept.points_per_frame, device=points.device)
+    columns = (first[:, None] + points).flatten()
+    chosen = replace(
+        kept,
+        pixels=kept.pixels[..., columns],
+        confidence=kept.confidence[..., columns],
+        sticks=torch.searchsorted(points, kept.sticks),
+        motion=kept.motion and kept.motion.at(columns),
+        point_names=kept.point_names and tuple(kept.point_names[point] for point in points.tolist()),
+    )
+    return chosen, replace(state, points=state.points[..., columns])
 
 
 def _metre(predictions: list[Prediction]) -> tuple[float, float]:
