@@ -73,7 +73,8 @@ def calibrate_many(
 ) -> ManyCalibrations:
     """Calibrate many sessions, except for those that the folder ``out`` already has.
 
-    The results do not depend on the executor, nor on the order. With ``out``, each session has a row in a manifest as soon as
+    The results do not depend on the executor, nor on the order, up to rounding errors: small sessions are adjusted side by side
+    in batches. With ``out``, each session has a row in a manifest as soon as
     its results are written: whatever is interrupted, the same call goes on with the sessions that are missing. A session that
     cannot be calibrated is a row with its error, and is not tried again unless ``retry`` asks for it.
 
