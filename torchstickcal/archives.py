@@ -21,6 +21,7 @@ def save_arrays(file: BinaryIO, arrays: Mapping[str, Any]) -> None:
         >>> import numpy as np
         >>> with io.BytesIO() as file:
         ...     save_arrays(file, {"lengths_m": np.array([1.0, 2.0])})
+        ...     _ = file.seek(0)
         ...     float(np.load(file)["lengths_m"][1])
         2.0
     """
