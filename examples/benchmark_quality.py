@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from torchstickcal import CalibrationError, Observations, Stick, calibrate
+from torchstickcal import CalibrationError, ObservationError, Observations, Stick, calibrate
 from torchstickcal.geometry import se3
 from torchstickcal.geometry.cameras import Intrinsics
 from torchstickcal.metrics import pose_errors
@@ -30,6 +30,7 @@ from torchstickcal.simulate.regimes import DetectorNoise, Gaps, Outliers, SelfOc
 SPORTS = ("golf", "baseball", "hockey", "kendo", "wand")
 LAYOUTS = ("ring", "hemisphere", "random", "arena")
 FOCAL_PX = 1200.0
+_MOST_DRAWS = 20
 
 Each = Callable[..., Any]
 """Applies a function to the numbers of sessions, as ``map`` does."""
@@ -38,11 +39,25 @@ Each = Callable[..., Any]
 def session(
     number: int, rng: np.random.Generator, cameras: int | None = None, outliers: float | None = None
 ) -> SimulatedSession:
-    """A session with the errors of a detector."""
+    """A session with the errors of a detector, in which the stick is seen at all."""
+    for _ in range(_MOST_DRAWS):
+        try:
+            return drawn(number, rng, cameras, outliers)
+        except ObservationError:
+            continue
+    raise RuntimeError(f"no usable session in {_MOST_DRAWS} draws")
+
+
+def drawn(number: int, rng: np.random.Generator, cameras: int | None, outliers: float | None) -> SimulatedSession:
+    """A session with the errors of a detector.
+
+    Raises:
+        ObservationError: if no two cameras see the stick at the same time.
+    """
     return SessionSpec(
         f"session{number}",
         SPORTS[number % len(SPORTS)],
-        seed=1000 + number,
+        seed=int(rng.integers(2**31)),
         cameras=int(rng.integers(2, 11)) if cameras is None else cameras,
         frames=int(rng.choice([60, 100, 160])),
         layout=str(rng.choice(LAYOUTS)),
@@ -391,7 +406,10 @@ def bad_session(number: int, seed: int) -> Outcome:
     cameras = int(rng.integers(kind.cameras, 9))
     given = session(number, rng, cameras, outliers=float(rng.uniform(0, 0.1)))
     camera = int(rng.integers(cameras))
-    observations = kind.make(given, camera, rng)
+    try:
+        observations = kind.make(given, camera, rng)
+    except CalibrationError as error:
+        return Outcome(name, cameras, "refused", [type(error).__name__])
     outcome = judged(given, observations, bool(number // len(names) % 2), name, _compared(kind, camera, cameras))
     outcome.right = not kind.codes or bool(outcome.codes and outcome.codes[0] in kind.codes)
     outcome.right |= outcome.verdict in ("good", "usable") and outcome.error_m < 0.01 * outcome.rig_m  # mended by itself

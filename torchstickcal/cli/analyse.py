@@ -6,8 +6,9 @@ import argparse
 from pathlib import Path
 from typing import Any
 
-from torchstickcal.cli.outputs import EXIT_DONE, POINTS_FILE
+from torchstickcal.cli.outputs import EXIT_DONE
 from torchstickcal.errors import CalibrationError
+from torchstickcal.files import POINTS_FILE
 
 PICTURES = ("curves.png", "repeated.png")
 

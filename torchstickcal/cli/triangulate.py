@@ -8,9 +8,8 @@ from dataclasses import replace
 from typing import Any
 
 from torchstickcal.cli.calibrate import given_of
-from torchstickcal.cli.outputs import EXIT_DONE, check_frame_rate, point_writers, write_json
-
-_REPORT = "report.json"
+from torchstickcal.cli.outputs import EXIT_DONE, point_writers, write_json
+from torchstickcal.files import REPORT_FILE
 
 
 def triangulate_session(options: argparse.Namespace) -> int:
@@ -18,13 +17,14 @@ def triangulate_session(options: argparse.Namespace) -> int:
     from torchstickcal.files import atomic_set, try_writing
     from torchstickcal.io import Motion, Rig, load_session
     from torchstickcal.io.results import read_result
+    from torchstickcal.outputs import check_frame_rate
     from torchstickcal.pipeline.triangulate import triangulate
     from torchstickcal.show.reconstruction import summary, table
 
     config = load_config(options.config)
     config = replace(config, synchronise=False) if options.no_sync else config
     writers = point_writers(options.write)
-    try_writing(options.out, [*writers, _REPORT])
+    try_writing(options.out, [*writers, REPORT_FILE])
     calibration = read_result(options.calibration)
     if isinstance(calibration, Rig):
         calibration = calibration.in_metres(options.units if calibration.unit is None else None)
@@ -39,9 +39,9 @@ def triangulate_session(options: argparse.Namespace) -> int:
     with atomic_set(options.out) as folder:
         for name, writer in writers.items():
             writer.write(folder / name, Motion.of(found))
-        write_json(folder / _REPORT, _provenance(options, list(session.notes)) | summary(found))
+        write_json(folder / REPORT_FILE, _provenance(options, list(session.notes)) | summary(found))
     print(table(found))
-    print(f"\n{', '.join([*writers, _REPORT])} in {options.out}")
+    print(f"\n{', '.join([*writers, REPORT_FILE])} in {options.out}")
     return EXIT_DONE
 
 
