@@ -13,7 +13,7 @@ import torchstickcal
 ROOT = Path(__file__).parents[1]
 FLOORS = [
     ["errors", "workers", "processes", "lazy", "precision", "samples"],
-    ["files", "shapes", "arrays"],
+    ["files", "shapes", "arrays", "archives"],
     ["untrusted"],
     ["registry", "skeletons"],
     ["settings"],
