@@ -17,7 +17,7 @@ from typing import NamedTuple
 import numpy as np
 import torch
 
-from torchstickcal import Calibration, CalibrationError, calibrate
+from torchstickcal import Calibration, CalibrationError, ObservationError, calibrate
 from torchstickcal.benchmark.bound import camera_bound
 from torchstickcal.benchmark.cases import Case
 from torchstickcal.io import Truth
@@ -26,6 +26,8 @@ from torchstickcal.simulate import Lens, SessionSpec
 from torchstickcal.simulate.regimes import DetectorNoise, Flips, Gaps, Outliers, Regime, SelfOcclusion, SwappedEnds, Views
 
 SPORTS, LAYOUTS = ("golf", "baseball", "hockey", "kendo"), ("ring", "hemisphere", "random", "arena")
+LARGEST_BOUND_M = 0.1
+"""Where the bound is larger, the stick is hardly seen: such sessions are left out."""
 LENS = Lens(distortion=(-0.1, 0.02, 0.0005, -0.0005, 0.0))
 
 
@@ -129,7 +131,7 @@ ROWS = {
 
 
 class Outcome(NamedTuple):
-    """Of one session; NaN where it was refused."""
+    """Of one session; NaN where it was refused, and a bound of NaN where it determines too little."""
 
     error_m: float
     bound_m: float
@@ -141,7 +143,7 @@ def outcome(number: int, name: str, seed: int) -> Outcome:
     """Simulate and calibrate a session of a row."""
     torch.set_num_threads(1)
     row = ROWS[name]
-    given = SessionSpec(
+    spec = SessionSpec(
         f"session{number}",
         SPORTS[number % 4],
         seed=seed + 1000 * list(ROWS).index(name) + number,
@@ -152,10 +154,14 @@ def outcome(number: int, name: str, seed: int) -> Outcome:
         radius_m=4.5,
         path=row.path,
         regimes=row.regimes,
-    ).generate()
+    )
+    try:
+        given = spec.generate()
+    except ObservationError:  # no two cameras see both ends of the stick
+        return Outcome(float("nan"), float("nan"), float("nan"))
     case = Case(given.name, given.observations, given.truth, sigma_px=given.sigma_px, inliers=given.inliers)
     bound = camera_bound(case, draws=300)
-    bound_m = float("nan") if bound is None else bound.translation_m
+    bound_m = float("nan") if bound is None or bound.translation_m > LARGEST_BOUND_M else bound.translation_m
     try:
         found = calibrate(given.observations)
     except CalibrationError:
@@ -188,6 +194,7 @@ def main() -> None:
     with ProcessPoolExecutor(options.jobs) as pool:
         for name, row in list(ROWS.items())[: options.rows or None]:
             found = np.array(list(pool.map(partial(outcome, name=name, seed=options.seed), range(options.sessions))))
+            found = found[np.isfinite(found[:, 1])]
             error, bound, squared = found.T
             print(
                 f"| {name} | {row.cameras} x {row.frames} | {1000 * np.nanmean(bound):.1f} mm "
