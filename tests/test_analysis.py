@@ -131,27 +131,34 @@ class TestAngles:
 
 
 class TestSmoothing:
-    def test_cubic_motion_is_not_bent(self):
+    def test_clear_motion_is_hardly_bent(self):
         times = np.arange(60) / FPS
         track = (2 + 3 * times - 40 * times**2 + 30 * times**3)[:, None, None]
         value, slope = smoother(times, track, np.full((60, 1), 1e-6))(track)
-        np.testing.assert_allclose(value, track, atol=1e-8)
-        np.testing.assert_allclose(slope[:, 0, 0], 3 - 80 * times + 90 * times**2, atol=1e-5)
+        np.testing.assert_allclose(value, track, atol=3e-4)  # of a noise of 1e-3
+        inner = slice(5, -5)
+        np.testing.assert_allclose(slope[inner, 0, 0], (3 - 80 * times + 90 * times**2)[inner], atol=0.02)
+        assert np.isnan(slope[0])  # an end alone says little of a velocity
+        line = 2 + 3 * times[:, None, None]
+        np.testing.assert_allclose(smoother(times, line, np.full((60, 1), 1e-6))(line)[0], line, atol=1e-9)
 
-    def test_stated_gain_is_right_and_short_gaps_are_bridged(self):
-        rng, times = np.random.default_rng(0), np.arange(400) / FPS
-        true = np.stack([np.sin(3 * times), np.cos(3 * times), times], axis=-1)[:, None].repeat(20, 1)
-        noisy = true + 0.01 * rng.standard_normal(true.shape)
-        noisy[100:103], noisy[200:220] = np.nan, np.nan
-        smooth = smoother(times, noisy, np.full((400, 20), 1e-4))
-        value, slope = smooth(noisy)
-        assert np.isfinite(value[100:103]).all()
-        assert np.isnan(value[205:215]).all()
-        speed = np.stack([3 * np.cos(3 * times), -3 * np.sin(3 * times), np.ones(400)], axis=-1)[:, None]
-        for error, gain in ((value - true, smooth.gains[..., 0]), (slope - speed, smooth.gains[..., 1])):
-            ratio = error / (0.01 * gain[..., None])
-            assert 0.9 < np.sqrt(np.nanmean(np.square(ratio))) < 1.25
-        assert np.nanmedian(smooth.gains[..., 0]) < 0.4
+    @pytest.mark.parametrize("turns_hz", [0.5, 2.0, 6.0])
+    def test_draws_are_as_wrong_as_the_estimate_and_short_gaps_are_bridged(self, turns_hz: float):
+        """Of fast motions too, where what smoothing leaves out is as large as the noise."""
+        rng, times = np.random.default_rng(0), np.arange(300) / FPS
+        phases, speed = rng.uniform(0, 6, 10), 2 * np.pi * turns_hz
+        angle = speed * times[:, None] + phases
+        true = np.stack([np.sin(angle), np.cos(angle)], axis=-1)
+        estimates = true + 0.01 * rng.standard_normal((21, *true.shape))
+        estimates[1:] += estimates[0] - true
+        estimates[:, 100:103], estimates[:, 200:220] = np.nan, np.nan
+        value, slope = smoother(times, estimates[0], np.full((300, 10), 1e-4))(estimates)
+        assert np.isfinite(value[:, 100:103]).all()
+        assert np.isnan(value[:, 205:215]).all()
+        for found, exact in ((value, true), (slope, speed * np.stack([np.cos(angle), -np.sin(angle)], axis=-1))):
+            error, stated = found[0] - exact, np.sqrt(np.square(found[1:] - found[0]).mean(0))
+            assert 0.7 < np.sqrt(np.nanmean(np.square(error / stated))) < 1.3
+        assert np.nanmedian(np.abs(value[0] - true)) < 0.9 * 0.01 * 0.6745
 
     def test_directions_that_turn_evenly_are_not_bent(self):
         times = np.arange(50) / FPS
@@ -162,9 +169,8 @@ class TestSmoothing:
         inner = slice(10, -10)
         np.testing.assert_allclose(unit[inner], direction[inner], atol=1e-9)
         np.testing.assert_allclose(np.linalg.norm(rate, axis=-1)[inner], 20, rtol=1e-9)
-        assert np.isnan(rate[0]).all()  # too few frames on one side for a velocity
         in_space = smoother(times, direction, np.full((50, 1), 1e-2))(direction)[1]
-        assert np.linalg.norm(in_space, axis=-1)[inner].min() < 19.5
+        assert np.linalg.norm(in_space, axis=-1)[inner].max() < 19.8
 
 
 class TestTracks:

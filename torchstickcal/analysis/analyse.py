@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torchstickcal.analysis.angles import ANGLES, Angle, missing_points, with_derived
-from torchstickcal.analysis.phases import EVENTS, Sport, at, events_of, sport_named, swing_peaks
+from torchstickcal.analysis.phases import EVENTS, Sport, at, events_of, lowest_at, sport_named, swing_peaks
 from torchstickcal.analysis.repeats import multiple_correlation, normalised
 from torchstickcal.analysis.smoothing import smoother
 from torchstickcal.analysis.stick import StickMotion, StickSmoother
@@ -140,7 +140,7 @@ def analysis_of(tracks: Tracks, sport: str, rules: Sport, stick: int, draws: int
     events = np.array(
         [[events_of(tracks.times, motion, peak, rules, tracks.up, n) for peak in peaks] for n in range(1 + draws)]
     ).reshape(1 + draws, len(peaks), len(EVENTS))
-    angles, notes = _angles(tracks, drawn, events)
+    angles, notes = _angles(tracks, drawn, events, seed)
     stacked = {**angles, "tip_speed": motion.tip_speed, "stick_turn_rate": np.degrees(motion.turn_rate)}
     units = {name: {"tip_speed": "m/s", "stick_turn_rate": "deg/s"}.get(name, "deg") for name in stacked}
     if rules.needs_up and tracks.up is None:
@@ -169,16 +169,16 @@ def _stick_motion(tracks: Tracks, drawn: Array, stick: int, seed: int) -> StickM
     *_, length_m, sigma_m = tracks.sticks[stick]
     lengths = length_m + sigma_m * np.random.default_rng((seed, 1)).standard_normal(len(drawn))
     lengths[0] = length_m
-    return StickSmoother.of(tracks, stick)(drawn, lengths)
+    return StickSmoother.of(tracks, stick)(drawn, lengths, seed)
 
 
-def _angles(tracks: Tracks, drawn: Array, events: Array) -> tuple[dict[str, Array], list[str]]:
+def _angles(tracks: Tracks, drawn: Array, events: Array, seed: int) -> tuple[dict[str, Array], list[str]]:
     """The angles (N, T) that the points determine, and sentences about those that are left out."""
     derived = with_derived(tracks.names, tracks.points, tracks.up)
     possible = {name: angle for name, angle in ANGLES.items() if not missing_points(angle, derived)}
     left_out = [name for name in ANGLES if name not in possible]
     index = [number for number, name in enumerate(tracks.names) if conventional(name) in _needed(possible)]
-    smooth, _ = smoother(tracks.times, tracks.points[:, index], tracks.variances[:, index])(drawn[:, :, index])
+    smooth, _ = smoother(tracks.times, tracks.points[:, index], tracks.variances[:, index])(drawn[:, :, index], seed)
     points = with_derived(tuple(tracks.names[number] for number in index), smooth, tracks.up)
     values = {name: _without_jumps(angle.of(points)) for name, angle in possible.items()}
     turns = [name for name, angle in possible.items() if angle.turns]
@@ -231,7 +231,7 @@ def _figures(
     takeaway, top, impact, finish = events
     times, speed = tracks.times, motion.tip_speed[number]
     inside = (times >= top) & (times <= finish)
-    peak = float(np.nanmax(speed[inside])) if np.isfinite(speed[inside]).any() else np.nan
+    peak = float(at(times, speed, lowest_at(times, -speed, np.flatnonzero(inside))))
     found = {
         "backswing": (top - takeaway, "s"),
         "downswing": (impact - top, "s"),

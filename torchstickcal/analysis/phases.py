@@ -70,19 +70,19 @@ class _Swing:
 
 def _fastest(swing: _Swing) -> float:
     frames = swing.between(swing.top_s, swing.finish_s)
-    return _lowest_at(swing.times, -swing.speed, frames)
+    return lowest_at(swing.times, -swing.speed, frames)
 
 
 def _through_address(swing: _Swing) -> float:
     at_address = at(swing.times, swing.tip, swing.takeaway_s)
     frames = swing.between(swing.top_s, swing.finish_s)
-    return _lowest_at(swing.times, np.square(swing.tip - at_address).sum(-1), frames)
+    return lowest_at(swing.times, np.square(swing.tip - at_address).sum(-1), frames)
 
 
 def _lowest_point(swing: _Swing) -> float:
     assert swing.up is not None
     frames = swing.between(swing.top_s, swing.finish_s)
-    return _lowest_at(swing.times, swing.tip @ swing.up, frames)
+    return lowest_at(swing.times, swing.tip @ swing.up, frames)
 
 
 def _stopped(swing: _Swing) -> float:
@@ -191,7 +191,7 @@ def _top(times: Array, rate: Array, peak: int) -> float:
         if rate[frame] < rate[slowest]:
             slowest = frame
         if rate[frame] > rate[slowest] + FAST_AGAIN * rate[peak]:
-            return _lowest_at(times, rate, np.array([slowest]))
+            return lowest_at(times, rate, np.array([slowest]))
     return np.nan
 
 
@@ -211,7 +211,7 @@ def _crossing(times: Array, values: Array, frame: int, level: float) -> float:
     return float(times[frame] + share * (times[frame + 1] - times[frame]))
 
 
-def _lowest_at(times: Array, values: Array, frames: NDArray[np.intp]) -> float:
+def lowest_at(times: Array, values: Array, frames: NDArray[np.intp]) -> float:
     """The time of the lowest of values (T,) in some frames, between frames by a parabola."""
     if not len(frames) or np.isnan(values[frames]).all():
         return np.nan

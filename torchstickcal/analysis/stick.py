@@ -62,11 +62,11 @@ class StickSmoother:
             smoother(tracks.times, along, variances / length_m**2, on_sphere(base)),
         )
 
-    def __call__(self, points: Array, lengths_m: Array) -> StickMotion:
-        """The motion by points (N, T, P, 3), with sticks of lengths (N,)."""
+    def __call__(self, points: Array, lengths_m: Array, seed: int = 0) -> StickMotion:
+        """The motion by points (N, T, P, 3), with sticks of lengths (N,); ``seed`` as of a smoother."""
         ends = points[:, :, list(self.ends)]
-        middle, velocity = self.middle(ends.mean(2, keepdims=True))
-        direction, rate = from_sphere(self.base, *self.direction(_direction(ends)[:, :, None]))
+        middle, velocity = self.middle(ends.mean(2, keepdims=True), (seed, 2))
+        direction, rate = from_sphere(self.base, *self.direction(_direction(ends)[:, :, None], (seed, 3)))
         half = 0.5 * lengths_m[:, None, None, None]
         parts = middle - half * direction, middle + half * direction, velocity - half * rate, velocity + half * rate
         start, tip, start_velocity, tip_velocity = (part[:, :, 0] for part in parts)
