@@ -103,7 +103,7 @@ class Smoother:
             kept += of_offset.T[:, :, None] * wave
         size = self.sizes[:, track, None]
         missed = (size * phases * (1 - kept[0]), size * phases * (1j * _FREQUENCIES / scales[:, None] - kept[1]))
-        value, slope = ((part @ waves).real.reshape(-1, count, axes).swapaxes(0, 1) for part in missed)
+        value, slope = ((part @ waves).real.reshape(len(scales), count, axes).swapaxes(0, 1) for part in missed)
         return value, slope
 
 

@@ -12,7 +12,7 @@ from torchstickcal.cli.calibrate import calibrate_session
 from torchstickcal.cli.calibrate_many import calibrate_sessions
 from torchstickcal.cli.check import check_session
 from torchstickcal.cli.convert import convert
-from torchstickcal.cli.detect import add_detect
+from torchstickcal.cli.detect import add_detect, add_detectors
 from torchstickcal.cli.evaluate import evaluate
 from torchstickcal.cli.info import info
 from torchstickcal.cli.listing import LISTS, list_names
@@ -78,8 +78,10 @@ def parser() -> argparse.ArgumentParser:
 
 
 def _add_calibrate(commands: Any) -> None:
-    command = commands.add_parser("calibrate", help="calibrate a session", description="Calibrate a session.")
-    _add_session(command)
+    command = commands.add_parser(
+        "calibrate", help="calibrate a session", description="Calibrate a session: keypoints, or videos."
+    )
+    _add_session(command, "a session; or one video for each camera, with --tape, --rtmlib or --weights")
     _add_out(command, "results")
     _add_format(command, "SESSION")
     _add_given(command)
@@ -95,6 +97,7 @@ def _add_calibrate(commands: Any) -> None:
     command.add_argument(
         "--split-moved", action="store_true", help="if a camera moved, calibrate again with its places before and after as two"
     )
+    add_detectors(command)
     _add_strict(command)
     command.add_argument("--verbose", action="store_true", help="show every table: lenses, clocks, sticks, points, stages")
     _add_plugin(command)

@@ -9,6 +9,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from torchstickcal.cli.detect import session_in
 from torchstickcal.cli.outputs import check_frame_rate, chosen_writers, result_names, show_results, write_results
 from torchstickcal.cli.world import placed, world_of
 from torchstickcal.errors import CalibrationError
@@ -34,7 +35,8 @@ def calibrate_session(options: argparse.Namespace) -> int:
     try_writing(options.out, result_names(writers))
     if options.tensorboard is not None:
         try_writing(options.tensorboard, where="--tensorboard")
-    session = load_session(options.session, options.format, given_of(options))
+    given = given_of(options)
+    session = load_session(session_in(options.session, options), options.format, given)
     for note in session.notes:
         print(f"note: {note}", file=sys.stderr)
     observations = with_stick(session.observations, options.stick_length, options.stick_sigma)
