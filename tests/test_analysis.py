@@ -14,7 +14,8 @@ import torch
 from torchstickcal import Calibration, CalibrationError, Observations, Stick, calibrate
 from torchstickcal.analysis import ANGLES, EVENTS, SPORTS, Analysis, analyse, multiple_correlation
 from torchstickcal.analysis.angles import missing_points, with_derived
-from torchstickcal.analysis.phases import at, events_of, swing_peaks
+from torchstickcal.analysis.interpolation import at
+from torchstickcal.analysis.phases import events_of, swing_peaks
 from torchstickcal.analysis.smoothing import from_sphere, on_sphere, smoother
 from torchstickcal.analysis.stick import StickMotion
 from torchstickcal.analysis.tracks import tracks_of

@@ -9,7 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torchstickcal.analysis.angles import ANGLES, Angle, missing_points, with_derived
-from torchstickcal.analysis.phases import EVENTS, Sport, at, events_of, lowest_at, sport_named, swing_peaks
+from torchstickcal.analysis.interpolation import at
+from torchstickcal.analysis.phases import EVENTS, Sport, events_of, lowest_at, sport_named, swing_peaks
 from torchstickcal.analysis.repeats import multiple_correlation, normalised
 from torchstickcal.analysis.smoothing import smoother
 from torchstickcal.analysis.stick import StickMotion, StickSmoother
@@ -22,6 +23,8 @@ Array = NDArray[np.float64]
 
 DRAWS = 40
 """How many times the errors are drawn; the standard deviations are then known to 11 %."""
+_FINER = 4
+"""Moments for each frame at which events are looked for."""
 _MOST_UNKNOWN = 0.2
 """Share of the draws in which a figure may be unknown."""
 
@@ -136,9 +139,10 @@ def analysis_of(tracks: Tracks, sport: str, rules: Sport, stick: int, draws: int
     _check(tracks, stick, draws)
     drawn = tracks.drawn(draws, seed)
     motion = _stick_motion(tracks, drawn, stick, seed)
-    peaks = swing_peaks(tracks.times, motion.turn_rate[0])
+    times, fine = motion.finer(tracks.times, _FINER)
+    peaks = swing_peaks(times, fine.turn_rate[0])
     events = np.array(
-        [[events_of(tracks.times, motion, peak, rules, tracks.up, n) for peak in peaks] for n in range(1 + draws)]
+        [[events_of(times, fine, peak, rules, tracks.up, n) for peak in peaks] for n in range(1 + draws)]
     ).reshape(1 + draws, len(peaks), len(EVENTS))
     angles, notes = _angles(tracks, drawn, events, seed)
     stacked = {**angles, "tip_speed": motion.tip_speed, "stick_turn_rate": np.degrees(motion.turn_rate)}

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from itertools import product
 
 import numpy as np
 from numpy.typing import NDArray
@@ -63,6 +64,8 @@ class Smoother:
     """(T, S), time scales of the motion, seconds"""
     sizes: Array
     """(T, S), standard deviations of the motion along an axis, in the unit of the values"""
+    smooth: NDArray[np.bool_]
+    """(T, S), whether the motion is very smooth: Matern of smoothness 7/2, else 5/2"""
     neighbours: Neighbours
 
     def __call__(self, values: Array, seed: int | tuple[int, ...] = 0) -> tuple[Array, Array]:
@@ -91,9 +94,8 @@ class Smoother:
         A motion is a sum of waves, whose phases advance with the time over its scale. Smoothing multiplies a wave by the sum of
         the weights times the wave at the offsets.
         """
-        power = (1 + _FREQUENCIES**2 / 7) ** -4.0 * np.gradient(_FREQUENCIES)
         coefficients = rng.standard_normal((2, len(_FREQUENCIES), count * axes))
-        waves = (coefficients[0] + 1j * coefficients[1]) * np.sqrt(power / power.sum())[:, None]
+        waves = coefficients[0] + 1j * coefficients[1]
         scales, step = self.scales_s[:, track], np.diff(self.times, prepend=self.times[:1])
         phases = np.exp(1j * np.cumsum(step / scales)[:, None] * _FREQUENCIES)
         kept = np.zeros((2, *phases.shape), dtype=complex)
@@ -101,7 +103,7 @@ class Smoother:
         for offset, of_offset in zip(range(-reach, reach + 1), self.weights[:, :, track], strict=True):
             wave = np.exp(1j * (_offsets(self.times, offset) / scales)[:, None] * _FREQUENCIES)
             kept += of_offset.T[:, :, None] * wave
-        size = self.sizes[:, track, None]
+        size = self.sizes[:, track, None] * np.where(self.smooth[:, track, None], _heights(7), _heights(5))
         missed = (size * phases * (1 - kept[0]), size * phases * (1j * _FREQUENCIES / scales[:, None] - kept[1]))
         value, slope = ((part @ waves).real.reshape(len(scales), count, axes).swapaxes(0, 1) for part in missed)
         return value, slope
@@ -132,20 +134,20 @@ def smoother(times: Array, values: Array, variances: Array, neighbours: Neighbou
     usable = np.where(known, variances, np.nan)
     typical = np.array([np.median(v[np.isfinite(v)]) if np.isfinite(v).any() else 1.0 for v in usable.T])
     near = np.stack([neighbours(np.where(known[..., None], values, np.nan), offset) for offset in offsets])
-    scales, sizes = _likeliest(near / np.sqrt(typical)[:, None], step)
+    scales, sizes, smooth = _likeliest(near / np.sqrt(typical)[:, None], step)
     noise = np.stack([shifted(usable[..., None] / typical[:, None], offset)[..., 0] for offset in offsets])
     noise[~np.isfinite(near).all(-1)] = np.nan
     apart = np.stack([_offsets(times, offset) for offset in offsets])
     weights = np.empty((*noise.shape, 2))
     for first in range(0, frames, max(1, _CHUNK // max(1, values.shape[1]))):
         part = slice(first, first + max(1, _CHUNK // max(1, values.shape[1])))
-        weights[:, part] = _weights(apart[:, part], noise[:, part], scales[part], sizes[part])
+        weights[:, part] = _weights(apart[:, part], noise[:, part], scales[part], sizes[part], smooth[part])
     estimated = _near_a_value(known, max(_FARTHEST_FRAMES, round(_FARTHEST_S / step)))
     seen = np.isfinite(noise)
     estimated &= seen.sum(0) > _TREND
     with_slope = estimated & (seen[:reach].sum(0) >= _BESIDE) & (seen[reach + 1 :].sum(0) >= _BESIDE)
     weights = np.where(np.stack([estimated, with_slope], axis=-1), weights, np.nan)
-    return Smoother(times, weights, scales, sizes * np.sqrt(typical), neighbours)
+    return Smoother(times, weights, scales, sizes * np.sqrt(typical), smooth, neighbours)
 
 
 def _offsets(times: Array, offset: int) -> Array:
@@ -153,20 +155,26 @@ def _offsets(times: Array, offset: int) -> Array:
     return np.nan_to_num((shifted(times[:, None, None], offset) - times[:, None, None])[:, 0, 0])
 
 
-def _covariance(apart: Array) -> Array:
-    """Of a motion of size 1 at times apart by so many time scales: Matern of smoothness 7/2."""
-    z = np.sqrt(7.0) * np.abs(apart)
-    return (1 + z + 0.4 * z**2 + z**3 / 15) * np.exp(-z)
+def _covariance(apart: Array, smooth: NDArray[np.bool_] | bool) -> Array:
+    """Of a motion of size 1 at times apart by so many time scales: Matern of smoothness 7/2 or 5/2."""
+    z = np.where(smooth, np.sqrt(7.0), np.sqrt(5.0)) * np.abs(apart)
+    return np.where(smooth, 1 + z + 0.4 * z**2 + z**3 / 15, 1 + z + z**2 / 3) * np.exp(-z)
 
 
-def _covariance_with_slope(apart: Array) -> Array:
+def _covariance_with_slope(apart: Array, smooth: NDArray[np.bool_] | bool) -> Array:
     """Of the derivative of such a motion at 0 with its values at times ``apart``."""
-    z = np.sqrt(7.0) * np.abs(apart)
-    return 1.4 * apart * (1 + z + z**2 / 3) * np.exp(-z)
+    z = np.where(smooth, np.sqrt(7.0), np.sqrt(5.0)) * np.abs(apart)
+    return np.where(smooth, 1.4 * (1 + z + z**2 / 3), 5 / 3 * (1 + z)) * apart * np.exp(-z)
 
 
-def _likeliest(near: Array, step: float) -> tuple[Array, Array]:
-    """Scales in seconds and sizes (T, S) that make the values (O, T, S, D) around each frame most likely.
+def _heights(freedom: int) -> Array:
+    """Of waves of :data:`_FREQUENCIES` that make a motion of size 1 and smoothness ``freedom / 2``."""
+    power = (1 + _FREQUENCIES**2 / freedom) ** (-(freedom + 1) / 2) * np.gradient(_FREQUENCIES)
+    return np.sqrt(power / power.sum())
+
+
+def _likeliest(near: Array, step: float) -> tuple[Array, Array, NDArray[np.bool_]]:
+    """Scales in seconds, sizes and smoothness (T, S) that make the values (O, T, S, D) around each frame most likely.
 
     Args:
         near: values in standard deviations.
@@ -176,7 +184,7 @@ def _likeliest(near: Array, step: float) -> tuple[Array, Array]:
     values = _bridged(near.reshape(count, frames * tracks, axes))
     seconds = step * (np.arange(count) - count // 2)
     best = np.full(frames * tracks, -np.inf)
-    chosen = np.zeros((2, frames * tracks), dtype=np.intp)
+    chosen = np.zeros((3, frames * tracks), dtype=np.intp)
     patterns, of_pattern = np.unique(np.isfinite(values).all(-1), axis=1, return_inverse=True)
     for number, pattern in enumerate(patterns.T):
         if pattern.sum() <= _TREND:
@@ -185,8 +193,8 @@ def _likeliest(near: Array, step: float) -> tuple[Array, Array]:
         at = seconds[pattern]
         free = np.linalg.qr(np.stack([np.ones_like(at), at], axis=-1), mode="complete")[0][:, _TREND:]
         seen = free.T @ values[pattern][:, index].reshape(pattern.sum(), -1)
-        for of_scale, scale in enumerate(SCALES_S):
-            spread, directions = np.linalg.eigh(free.T @ _covariance((at[:, None] - at) / scale) @ free)
+        for smooth, (of_scale, scale) in product((True, False), enumerate(SCALES_S)):
+            spread, directions = np.linalg.eigh(free.T @ _covariance((at[:, None] - at) / scale, smooth) @ free)
             squares = np.square(directions.T @ seen).reshape(len(spread), -1, axes).sum(-1)
             variances = 1 + SIZES[:, None] ** 2 * np.maximum(spread, 0.0)
             likelihood = -0.5 * ((1 / variances) @ squares + axes * np.log(variances).sum(-1, keepdims=True))
@@ -194,9 +202,10 @@ def _likeliest(near: Array, step: float) -> tuple[Array, Array]:
             value = np.take_along_axis(likelihood, of_size[None], 0)[0]
             better = value > best[index]
             best[index[better]] = value[better]
-            chosen[0, index[better]], chosen[1, index[better]] = of_scale, of_size[better]
+            chosen[:2, index[better]] = np.stack([np.full(better.sum(), of_scale), of_size[better]])
+            chosen[2, index[better]] = smooth
     shape = frames, tracks
-    return SCALES_S[chosen[0]].reshape(shape), SIZES[chosen[1]].reshape(shape)
+    return SCALES_S[chosen[0]].reshape(shape), SIZES[chosen[1]].reshape(shape), chosen[2].reshape(shape) > 0
 
 
 def _bridged(values: Array) -> Array:
@@ -211,22 +220,27 @@ def _bridged(values: Array) -> Array:
     return np.where(fill[..., None], first + share * (last - first), values)
 
 
-def _weights(apart: Array, noise: Array, scales: Array, sizes: Array) -> Array:
+def _weights(apart: Array, noise: Array, scales: Array, sizes: Array, smooth: NDArray[np.bool_]) -> Array:
     """Best weights (O, T, S, 2) of the values around each frame, for the value there and for its derivative.
 
     Args:
         apart: (O, T), seconds from the frame.
         noise: (O, T, S), variances of the values, relative to those of which the sizes are multiples; NaN where not known.
-        scales, sizes: (T, S), of the motion.
+        scales, sizes, smooth: (T, S), of the motion.
     """
     seen = np.isfinite(noise).transpose(1, 2, 0)
     at = apart.T[:, None] / scales[..., None]
     power = np.square(sizes)[..., None]
     both = seen[..., :, None] & seen[..., None, :]
-    covariance = np.where(both, power[..., None] * _covariance(at[..., :, None] - at[..., None, :]), 0.0)
+    covariance = np.where(
+        both, power[..., None] * _covariance(at[..., :, None] - at[..., None, :], smooth[..., None, None]), 0.0
+    )
     diagonal = np.arange(len(apart))
     covariance[..., diagonal, diagonal] += np.where(seen, noise.transpose(1, 2, 0), 1.0)
-    motion = [power * _covariance(at), power * _covariance_with_slope(at) / scales[..., None]]
+    motion = [
+        power * _covariance(at, smooth[..., None]),
+        power * _covariance_with_slope(at, smooth[..., None]) / scales[..., None],
+    ]
     line = [np.ones_like(at), at]
     right = np.where(seen[..., None], np.stack([*motion, *line], axis=-1), 0.0)
     solved = np.linalg.solve(covariance, right)
