@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import importlib.util
 import json
 from dataclasses import replace
 from pathlib import Path
@@ -11,7 +12,7 @@ import numpy as np
 import pytest
 import torch
 
-from torchstickcal import Calibration, CalibrationError, Observations, Stick, calibrate
+from torchstickcal import Calibration, CalibrationError, Observations, Stick, calibrate, triangulate
 from torchstickcal.analysis import ANGLES, EVENTS, SPORTS, Analysis, analyse, multiple_correlation
 from torchstickcal.analysis.angles import missing_points, with_derived
 from torchstickcal.analysis.interpolation import at
@@ -20,6 +21,7 @@ from torchstickcal.analysis.smoothing import from_sphere, on_sphere, smoother
 from torchstickcal.analysis.stick import StickMotion
 from torchstickcal.analysis.tracks import tracks_of
 from torchstickcal.cli import main
+from torchstickcal.io import Rig, write_npz
 from torchstickcal.simulate import Motion, action
 from torchstickcal.simulate.rigs import Lens, camera_rig
 from torchstickcal.simulate.skeleton import JOINTS
@@ -51,6 +53,20 @@ def recorded(sport: str, seconds: float, sigma_px: float = 1.5, fps: float = FPS
         point_names=NAMES,
     )
     return calibrate(observations), points @ rig.rotations[0].T + rig.translations[0], rig.rotations[0] @ UP
+
+
+def seen_by(calibration: Calibration, points: np.ndarray) -> Observations:
+    """Keypoints of points in the frame of a calibration, with errors of a pixel."""
+    moved = torch.from_numpy(points).flatten(0, 1) @ calibration.rotations.mT + calibration.translations[:, None]
+    exact = calibration._cameras().project(moved).unflatten(1, points.shape[:2])
+    return Observations(
+        exact + torch.from_numpy(np.random.default_rng(9).standard_normal(exact.shape)),
+        calibration.intrinsics,
+        Stick("butt", "tip", action("golf").stick_m),
+        camera_names=calibration.camera_names,
+        fps=FPS,
+        point_names=NAMES,
+    )
 
 
 @pytest.fixture(scope="module")
@@ -337,10 +353,10 @@ class TestRepeats:
 def test_command_writes_tables_and_pictures(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     calibration, _, _ = recorded("kendo", 5.4, fps=50.0)
     calibration.save(tmp_path / "points.npz")
-    assert main(["analyse", str(tmp_path), "--sport", "kendo"]) == 0
+    assert main(["analyse", str(tmp_path), "--sport", "kendo", "--write", "trc"]) == 0
     assert "tempo" in capsys.readouterr().out
     files = sorted(file.name for file in (tmp_path / "analysis").iterdir())
-    assert files == ["analysis.json", "curves.csv", "curves.png", "repeated.csv", "repeated.png", "swings.csv"]
+    assert files == ["analysis.json", "curves.csv", "curves.png", "points.trc", "repeated.csv", "repeated.png", "swings.csv"]
     content = json.loads((tmp_path / "analysis" / "analysis.json").read_text())
     assert len(content["swings"]) == 2
     assert 0.9 < content["multiple_correlation"]["stick_turn_rate"]["value"] <= 1
@@ -352,6 +368,62 @@ def test_command_writes_tables_and_pictures(tmp_path: Path, capsys: pytest.Captu
     assert [row["per_cent"] for row in repeated[:2]] == ["0", "1"]
 
 
+def test_triangulated_recording_is_analysed_by_the_same_command(golf, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    """And its C3D file has the phases as events."""
+    calibration, true, _ = golf
+    given = seen_by(calibration, true)
+    calibration.save(tmp_path / "points.npz")
+    write_npz(tmp_path / "swing.npz", given)
+    formats = ["--write", "c3d"] if importlib.util.find_spec("ezc3d") else []
+    command = ["triangulate", str(tmp_path / "swing.npz"), "--calibration", str(tmp_path / "points.npz"), "--analyse", "golf"]
+    assert main([*command, "--out", str(tmp_path / "out"), *formats]) == 0
+    assert "tempo" in capsys.readouterr().out
+    swing = json.loads((tmp_path / "out" / "analysis" / "analysis.json").read_text())["swings"][0]
+    if formats:
+        import ezc3d
+
+        event = ezc3d.c3d(str(tmp_path / "out" / "analysis" / "points.c3d"))["parameters"]["EVENT"]
+        assert event["LABELS"]["value"] == list(EVENTS)
+        np.testing.assert_allclose(event["TIMES"]["value"][1], [swing["events"][name]["value"] for name in EVENTS], atol=1e-4)
+
+
 def test_command_without_a_calibration_says_so(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     assert main(["analyse", str(tmp_path)]) == 2
     assert "torchstickcal calibrate" in capsys.readouterr().err
+
+
+class TestOtherRecordings:
+    def test_frame_of_the_world_changes_no_angle(self, golf):
+        calibration, _, up = golf
+        same = analyse(calibration, "golf", up=up, draws=5)
+        placed = calibration.in_world("athlete")
+        assert abs(tracks_of(placed).up @ [0, 0, 1]) > np.cos(np.radians(3))
+        found = analyse(placed, "golf", up=placed.rotations[0].T.numpy() @ up, draws=5)
+        for curve in ("left_elbow_flexion", "trunk_lean", "tip_speed"):
+            np.testing.assert_allclose(found.curves[curve].values, same.curves[curve].values, atol=1e-4)
+            assert 0.7 < np.nanmedian(found.curves[curve].std / same.curves[curve].std) < 1.4
+
+    def test_vertical_is_that_of_a_measured_frame(self, golf):
+        placed = golf[0].in_world("athlete")
+        tilted = replace(placed, world=replace(placed.world, name="points"))
+        assert tracks_of(tilted).up.tolist() == [0, 0, 1]
+        assert "z axis of the frame" in tracks_of(tilted).notes[0]
+
+    def test_triangulated_swing_is_analysed_as_one_that_was_calibrated(self, golf, golf_analysis):
+        """Also by fewer cameras in another order, and with cameras of a file, of whose errors nothing is known."""
+        calibration, true, _ = golf
+        given = seen_by(calibration, true)
+        (swing,) = analyse(triangulate(given, calibration), "golf", draws=4).swings
+        for event in EVENTS:
+            assert swing.events[event].value == pytest.approx(golf_analysis.swings[0].events[event].value, abs=1.5 / FPS)
+        some = [2, 0, 3]
+        names = [calibration.camera_names[number] for number in some]
+        fewer = replace(given, keypoints=given.keypoints[some], intrinsics=given.intrinsics[some], camera_names=names)
+        found = triangulate(fewer, Rig.of_calibration(calibration))
+        assert not found.covariance.any()
+        tracks = tracks_of(found)
+        noise = np.sqrt(tracks.variances)[..., None]
+        assert 0.8 < np.sqrt(np.nanmean(np.square((tracks.points - true) / noise))) < 1.2
+        without = replace(found, sticks=())
+        with pytest.raises(CalibrationError, match="a recording with a stick"):
+            analyse(without, "golf")

@@ -17,6 +17,7 @@ from torchstickcal.analysis.stick import StickMotion, StickSmoother
 from torchstickcal.analysis.tracks import Tracks, tracks_of
 from torchstickcal.errors import CalibrationError
 from torchstickcal.io.skeletons import conventional
+from torchstickcal.reconstruction import Reconstruction
 from torchstickcal.result import Calibration
 
 Array = NDArray[np.float64]
@@ -93,7 +94,7 @@ class Analysis:
 
 
 def analyse(
-    calibration: Calibration,
+    calibration: Calibration | Reconstruction,
     sport: str = "any",
     *,
     fps: float | None = None,
@@ -102,16 +103,18 @@ def analyse(
     draws: int = DRAWS,
     seed: int = 0,
 ) -> Analysis:
-    """Angles, stick kinematics, phases and repeated swings of a calibrated session.
+    """Angles, stick kinematics, phases and repeated swings of a calibrated session, or of one that was triangulated.
 
     Points are triangulated frame by frame and smoothed over as many frames as the motion allows. For the
     standard deviations, errors of keypoints, cameras and stick length are drawn at random, and all is calculated again.
 
     Args:
-        calibration: of the session. Points need the names of a skeleton.
+        calibration: of the session, or what :func:`torchstickcal.triangulate` found in another one. Points need the names of a
+            skeleton.
         sport: whose rule for the impact is used: ``golf``, ``baseball``, ``hockey``, ``kendo`` or ``any``.
         fps: frames per second; None for those of the calibration.
-        up: the vertical in the frame of the first camera; None to take it from the cameras, if they stand level.
+        up: the vertical in the frame of the calibration; None to take it from the cameras, if they stand level, or from the
+            frame.
         stick: which of the sticks.
         draws: how many times errors are drawn, 2 or more. seed: of the random numbers.
 
@@ -161,7 +164,7 @@ def analysis_of(tracks: Tracks, sport: str, rules: Sport, stick: int, draws: int
 
 def _check(tracks: Tracks, stick: int, draws: int) -> None:
     if not 0 <= stick < len(tracks.sticks):
-        expected = f"0 to {len(tracks.sticks) - 1}"
+        expected = f"0 to {len(tracks.sticks) - 1}" if tracks.sticks else "a recording with a stick"
         raise CalibrationError("no stick of that number", where="stick", got=stick, expected=expected)
     if draws < 2:
         raise CalibrationError("too few draws for a standard deviation", where="draws", got=draws, expected="2 or more")

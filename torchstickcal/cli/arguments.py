@@ -204,6 +204,12 @@ def _add_triangulate(commands: Any) -> None:
     _add_config(command)
     _add_no_sync(command)
     _add_write(command, "points: trc, c3d, csv, npz (default: npz);")
+    command.add_argument(
+        "--analyse",
+        metavar="SPORT",
+        help="also write joint angles, phases and figures of the swings, as `torchstickcal analyse` does, into `analysis` in "
+        "DIR: golf, baseball, hockey, kendo or any",
+    )
     _add_units(command)
     _add_plugin(command)
     command.set_defaults(run=triangulate_session, intrinsics=None)

@@ -7,6 +7,7 @@ import sys
 from dataclasses import replace
 from typing import Any
 
+from torchstickcal.cli.analyse import write_analysis
 from torchstickcal.cli.calibrate import given_of
 from torchstickcal.cli.outputs import EXIT_DONE, check_frame_rate, point_writers, write_json
 
@@ -42,6 +43,9 @@ def triangulate_session(options: argparse.Namespace) -> int:
         write_json(folder / _REPORT, _provenance(options, list(session.notes)) | summary(found))
     print(table(found))
     print(f"\n{', '.join([*writers, _REPORT])} in {options.out}")
+    if options.analyse is not None:
+        print()
+        write_analysis(found, options.out / "analysis", options.analyse, "c3d" if "points.c3d" in writers else None)
     return EXIT_DONE
 
 
