@@ -61,8 +61,8 @@ def in_world(spec: SessionSpec, times: Array) -> Array:
     return np.concatenate([points[:, : len(JOINTS)], hips, points[:, len(JOINTS) :]], axis=1)
 
 
-def scene(sport: str, seed: int, fps: float, sigma_px: float, stick_sigma_px: float) -> Scene:
-    frames = round(spec_seconds(sport) * fps)
+def scene(sport: str, seed: int, fps: float, sigma_px: float, stick_sigma_px: float, seconds: float | None = None) -> Scene:
+    frames = round((seconds or spec_seconds(sport)) * fps)
     spec = SessionSpec(sport, sport, seed=seed, cameras=4, frames=frames, fps=fps, layout="ring", path="circle")
     rng = np.random.default_rng(seed)
     rig = camera_rig("ring", 4, rng, LENS, 4.5)
