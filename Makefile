@@ -7,8 +7,9 @@ SEED ?= 0
 
 .PHONY: demo test quick test-slow test-oldest fuzz lint docs clean
 
-# The matrices are small: one thread computes faster than several that wait for each other.
+# The matrices are small: one thread computes faster than several that wait for each other. Files of tests run side by side.
 PYTEST := OMP_NUM_THREADS=1 $(VENV)/bin/python -m pytest
+SIDE_BY_SIDE := --numprocesses auto --maxprocesses 4 --dist loadfile
 QUICK := architecture calibrate cameras config elimination extrinsics initialise io layer losses metrics noise observations se3 \
 	solvers trajectories workers
 
@@ -16,16 +17,16 @@ demo: $(INSTALLED)
 	$(VENV)/bin/torchstickcal demo --out demo
 
 test: $(INSTALLED)
-	$(PYTEST)
+	$(PYTEST) $(SIDE_BY_SIDE)
 
 quick: $(INSTALLED)
-	$(PYTEST) $(QUICK:%=tests/test_%.py)
+	$(PYTEST) $(SIDE_BY_SIDE) $(QUICK:%=tests/test_%.py)
 
 test-slow: $(INSTALLED)
 	$(PYTEST) -m slow
 
 test-oldest: $(OLDEST)/.installed
-	OMP_NUM_THREADS=1 $(OLDEST)/bin/python -m pytest
+	OMP_NUM_THREADS=1 $(OLDEST)/bin/python -m pytest $(SIDE_BY_SIDE)
 
 fuzz: $(INSTALLED)
 	TORCHSTICKCAL_FUZZ=large $(PYTEST) tests/fuzz --hypothesis-seed=$(SEED)

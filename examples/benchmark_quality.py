@@ -9,14 +9,18 @@ from __future__ import annotations
 
 import argparse
 import collections
+import itertools
 import time
 from collections.abc import Callable
+from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
+from functools import partial
+from typing import Any
 
 import numpy as np
 import torch
 
-from torchstickcal import CalibrationError, Observations, Stick, calibrate
+from torchstickcal import CalibrationError, ObservationError, Observations, Stick, calibrate
 from torchstickcal.geometry import se3
 from torchstickcal.geometry.cameras import Intrinsics
 from torchstickcal.metrics import pose_errors
@@ -26,16 +30,34 @@ from torchstickcal.simulate.regimes import DetectorNoise, Gaps, Outliers, SelfOc
 SPORTS = ("golf", "baseball", "hockey", "kendo", "wand")
 LAYOUTS = ("ring", "hemisphere", "random", "arena")
 FOCAL_PX = 1200.0
+_MOST_DRAWS = 20
+
+Each = Callable[..., Any]
+"""Applies a function to the numbers of sessions, as ``map`` does."""
 
 
 def session(
     number: int, rng: np.random.Generator, cameras: int | None = None, outliers: float | None = None
 ) -> SimulatedSession:
-    """A session with the errors of a detector."""
+    """A session with the errors of a detector, in which the stick is seen at all."""
+    for _ in range(_MOST_DRAWS):
+        try:
+            return drawn(number, rng, cameras, outliers)
+        except ObservationError:
+            continue
+    raise RuntimeError(f"no usable session in {_MOST_DRAWS} draws")
+
+
+def drawn(number: int, rng: np.random.Generator, cameras: int | None, outliers: float | None) -> SimulatedSession:
+    """A session with the errors of a detector.
+
+    Raises:
+        ObservationError: if no two cameras see the stick at the same time.
+    """
     return SessionSpec(
         f"session{number}",
         SPORTS[number % len(SPORTS)],
-        seed=1000 + number,
+        seed=int(rng.integers(2**31)),
         cameras=int(rng.integers(2, 11)) if cameras is None else cameras,
         frames=int(rng.choice([60, 100, 160])),
         layout=str(rng.choice(LAYOUTS)),
@@ -345,14 +367,16 @@ def judged(
     )
 
 
-def sound(count: int, seed: int) -> None:
+def sound_session(number: int, seed: int) -> Outcome:
+    """What is said of one sound session."""
+    given = session(number, np.random.default_rng((seed, number)))
+    return judged(given, given.observations, bool(number % 2), given.name)
+
+
+def sound(count: int, seed: int, each: Each) -> None:
     """False alarms among sound sessions, and what the judgement costs."""
-    outcomes = []
-    for number in range(count):
-        rng = np.random.default_rng((seed, number))
-        given = session(number, rng)
-        outcome = judged(given, given.observations, bool(number % 2), given.name)
-        outcomes.append(outcome)
+    outcomes = list(each(partial(sound_session, seed=seed), range(count)))
+    for number, outcome in enumerate(outcomes):
         if outcome.verdict not in ("good", "usable"):
             print("   ", number, SPORTS[number % 5], outcome, flush=True)
     verdicts = collections.Counter(outcome.verdict for outcome in outcomes)
@@ -373,24 +397,32 @@ def _compared(kind: Kind, camera: int, cameras: int) -> list[int]:
     return [other for other in range(cameras) if not kind.elsewhere or other != camera]
 
 
-def bad(count: int, seed: int) -> None:
-    """Bad sessions of every kind, and combinations of two."""
-    outcomes: dict[str, list[Outcome]] = collections.defaultdict(list)
+def bad_session(number: int, seed: int) -> Outcome:
+    """What is said of one bad session, of the kinds in turn; with clocks and lenses as given, and with ``auto``."""
+    rng = np.random.default_rng((seed, number, 7))
     names = list(KINDS)
-    for number in range(count):
-        rng = np.random.default_rng((seed, number, 7))
-        chosen = [names[number % len(names)]]
-        kinds = [KINDS[name] for name in chosen]
-        cameras = int(rng.integers(max(kind.cameras for kind in kinds), 9))
-        given = session(number, rng, cameras, outliers=float(rng.uniform(0, 0.1)))
-        camera = int(rng.integers(cameras))
-        observations = kinds[0].make(given, camera, rng)
-        outcome = judged(given, observations, bool(number // len(names) % 2), given.name, _compared(kinds[0], camera, cameras))
-        outcome.right = not kinds[0].codes or bool(outcome.codes and outcome.codes[0] in kinds[0].codes)
-        outcome.right |= outcome.verdict in ("good", "usable") and outcome.error_m < 0.01 * outcome.rig_m  # mended by itself
-        outcomes[chosen[0]].append(outcome)
+    name = names[number % len(names)]
+    kind = KINDS[name]
+    cameras = int(rng.integers(kind.cameras, 9))
+    given = session(number, rng, cameras, outliers=float(rng.uniform(0, 0.1)))
+    camera = int(rng.integers(cameras))
+    try:
+        observations = kind.make(given, camera, rng)
+    except CalibrationError as error:
+        return Outcome(name, cameras, "refused", [type(error).__name__])
+    outcome = judged(given, observations, bool(number // len(names) % 2), name, _compared(kind, camera, cameras))
+    outcome.right = not kind.codes or bool(outcome.codes and outcome.codes[0] in kind.codes)
+    outcome.right |= outcome.verdict in ("good", "usable") and outcome.error_m < 0.01 * outcome.rig_m  # mended by itself
+    return outcome
+
+
+def bad(count: int, seed: int, each: Each) -> None:
+    """Bad sessions of every kind."""
+    outcomes: dict[str, list[Outcome]] = collections.defaultdict(list)
+    for number, outcome in enumerate(each(partial(bad_session, seed=seed), range(count))):
+        outcomes[outcome.name].append(outcome)
         if outcome.confidently_wrong or not outcome.right:
-            print("   ", number, chosen[0], "cam", camera, outcome, flush=True)
+            print("   ", number, outcome, flush=True)
     print(
         f"\n{'kind of bad session':46} {'n':>3} {'good':>5} {'usable':>6} {'poor':>5} {'failed':>6} {'refused':>7} "
         f"{'conf. wrong':>11} cause"
@@ -411,24 +443,30 @@ def bad(count: int, seed: int) -> None:
     )
 
 
-def steps(count: int, seed: int) -> None:
+def step_of_a_camera(number: int, seed: int) -> tuple[str, bool, tuple[bool, bool, bool]]:
+    """The step, whether one is found without it; whether one is found with it, of the right camera, and within two frames."""
+    rng = np.random.default_rng((seed, number, 9))
+    given = session(number, rng, int(rng.integers(3, 9)))
+    frames, cameras = given.observations.num_frames, given.observations.num_cameras
+    false = any(f.code in MOVED for f in calibrate(given.observations).quality.findings)
+    frame, camera = int(rng.uniform(0.2, 0.8) * frames), int(rng.integers(cameras))
+    turn, shift = ((0.1, 0.0), (0.0, 0.005), (0.3, 0.0), (0.0, 0.015))[number % 4]
+    keypoints = knocked(given, camera, step_at(frames, frame), turn, shift, rng)
+    quality = calibrate(replace(given.observations, keypoints=keypoints)).quality
+    said = [f for f in quality.findings if f.code == "camera_moved"]
+    own = [f for f in said if f.cameras == (given.observations.camera_label(camera),) and f.frames]
+    near = any(abs(f.frames[0] - frame) <= 2 for f in own if f.frames)
+    label = f"{turn:g} degrees" if turn else f"{1000 * shift:g} mm"
+    return label, false, (bool(said), bool(own), near)
+
+
+def steps(count: int, seed: int, each: Each) -> None:
     """A step of 0.1 degrees or 5 mm of one camera."""
     found: dict[str, list[tuple[bool, bool, bool]]] = collections.defaultdict(list)
     false = 0
-    for number in range(count):
-        rng = np.random.default_rng((seed, number, 9))
-        given = session(number, rng, int(rng.integers(3, 9)))
-        frames, cameras = given.observations.num_frames, given.observations.num_cameras
-        false += any(f.code in MOVED for f in calibrate(given.observations).quality.findings)
-        frame, camera = int(rng.uniform(0.2, 0.8) * frames), int(rng.integers(cameras))
-        turn, shift = ((0.1, 0.0), (0.0, 0.005), (0.3, 0.0), (0.0, 0.015))[number % 4]
-        keypoints = knocked(given, camera, step_at(frames, frame), turn, shift, rng)
-        quality = calibrate(replace(given.observations, keypoints=keypoints)).quality
-        said = [f for f in quality.findings if f.code == "camera_moved"]
-        own = [f for f in said if f.cameras == (given.observations.camera_label(camera),) and f.frames]
-        near = any(abs(f.frames[0] - frame) <= 2 for f in own if f.frames)
-        label = f"{turn:g} degrees" if turn else f"{1000 * shift:g} mm"
-        found[label].append((bool(said), bool(own), near))
+    for label, falsely, rightly in each(partial(step_of_a_camera, seed=seed), range(count)):
+        false += falsely
+        found[label].append(rightly)
     print(
         f"\nSteps of one camera, of {count} sessions of 60 to 160 frames, 3 to 8 cameras; "
         f"false steps in sound ones: {false / count:.1%}"
@@ -450,21 +488,22 @@ def biased(given: SimulatedSession, rng: np.random.Generator, sigma_px: float) -
     return replace(given.observations, keypoints=given.observations.keypoints + torch.from_numpy(sigma_px * errors))
 
 
-def lengths(count: int, seed: int) -> None:
+def left_out_lengths(number: int, seed: int, sigma_px: float) -> list[tuple[float, int, float]]:
+    """Of each stick: the share of its lengths inside their intervals, their number, and what is said of a metre."""
+    rng = np.random.default_rng((seed, number, 11))
+    given = session(number, rng)
+    observations = biased(given, rng, sigma_px) if sigma_px else given.observations
+    quality = calibrate(observations).quality
+    if not quality.verdict.acceptable or quality.acceptance is None:
+        return []
+    return [(one.inside, one.frames, quality.acceptance.metre_m) for one in quality.acceptance.lengths]
+
+
+def lengths(count: int, seed: int, each: Each) -> None:
     """How many lengths that took no part lie inside their 95 % interval, and how right the sentence about a metre is."""
     for label, sigma_px in (("independent errors", 0.0), ("and errors of 2 px that last 10 frames", 2.0)):
-        inside, weights, metre = [], [], []
-        for number in range(count):
-            rng = np.random.default_rng((seed, number, 11))
-            given = session(number, rng)
-            observations = biased(given, rng, sigma_px) if sigma_px else given.observations
-            calibration = calibrate(observations)
-            if not calibration.quality.verdict.acceptable or calibration.quality.acceptance is None:
-                continue
-            for one in calibration.quality.acceptance.lengths:
-                inside.append(one.inside)
-                weights.append(one.frames)
-                metre.append(calibration.quality.acceptance.metre_m)
+        one_by_one = each(partial(left_out_lengths, seed=seed, sigma_px=sigma_px), range(count))
+        inside, weights, metre = zip(*itertools.chain.from_iterable(one_by_one), strict=True)
         total = np.average(inside, weights=weights)
         print(
             f"\nLengths that took no part, {len(inside)} sessions, {label}: {total:.1%} inside their 95 % intervals; "
@@ -484,13 +523,15 @@ def main() -> None:
     ):
         parser.add_argument(f"--{name}", type=int, default=0, metavar="N", help=help)
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--jobs", type=int, default=1, metavar="N", help="processes")
     options = parser.parse_args()
     parts = (sound, bad, steps, lengths)
     if not any(getattr(options, part.__name__) for part in parts):
         parser.print_help()
-    for part in parts:
-        if count := getattr(options, part.__name__):
-            part(count, options.seed)
+    with ProcessPoolExecutor(options.jobs) as pool:
+        for part in parts:
+            if count := getattr(options, part.__name__):
+                part(count, options.seed, pool.map)
 
 
 if __name__ == "__main__":

@@ -50,6 +50,7 @@ FLOORS = [
     ["pipeline"],
     ["layer"],
     ["show"],
+    ["outputs"],
     ["analysis", "video", "many"],
     ["simulate"],
     ["benchmark.baselines"],

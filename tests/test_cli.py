@@ -8,6 +8,7 @@ import os
 import signal
 import subprocess
 import sys
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -282,7 +283,8 @@ def test_a_console_that_is_gone_changes_nothing(redirection: str, status: int):
 @pytest.mark.skipif(os.name == "nt", reason="needs POSIX signals")
 def test_an_interrupted_command_ends_at_once_with_one_line(tmp_path: Path):
     (tmp_path / "plugin.py").write_text("import time; print('started', flush=True); time.sleep(60)")
-    process = command("list", "--plugin", tmp_path / "plugin.py")
+    heard = partial(signal.signal, signal.SIGINT, signal.default_int_handler)  # a job in the background inherits deafness
+    process = command("list", "--plugin", tmp_path / "plugin.py", preexec_fn=heard)
     assert process.stdout is not None
     assert process.stdout.readline() == "started\n"
     process.send_signal(signal.SIGINT)

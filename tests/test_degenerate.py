@@ -15,7 +15,7 @@ from torchstickcal.config import Refine
 from torchstickcal.geometry.singular import covariance_of, solve_information
 from torchstickcal.model.measurements import Measurements
 from torchstickcal.pipeline.initialise.graph import _resected
-from torchstickcal.pipeline.scale import Ruler, scale_factors
+from torchstickcal.pipeline.scale import Ruler, outvoted_factors, scale_factors
 from torchstickcal.pipeline.synchronise import search_offsets
 from torchstickcal.pipeline.synchronise.search import unsynchronised
 from torchstickcal.simulate import Noise, golf_session
@@ -148,6 +148,28 @@ def test_a_ruler_that_is_never_reconstructed_sets_no_scale():
     factors.sum().backward()
     assert points.grad is not None
     assert not points.grad.any()
+
+
+def test_most_lengths_outvote_a_few_that_are_right_by_chance():
+    case, truth = golf_session(cameras=3, frames=20)
+    measurements = Measurements.of(replace(case, sticks=[*case.sticks]))
+    assert truth.points is not None
+    (start, end), known = case.sticks[0].ends, case.sticks[0].length_m
+    ruler = Ruler((start,), (end,), torch.tensor([known], dtype=torch.float64), rigid=True)
+
+    def factor(lengths_m: Tensor) -> float:
+        points = truth.points.clone()
+        direction = torch.nn.functional.normalize(points[:, end] - points[:, start], dim=-1)
+        points[:, end] = points[:, start] + lengths_m[:, None] * direction
+        return float(outvoted_factors(measurements, points.flatten(0, 1).mT[None].contiguous(), [ruler]))
+
+    alone, scatter = torch.linspace(0.3, 3.0, 20, dtype=torch.float64), torch.linspace(-0.01, 0.01, 20, dtype=torch.float64)
+    most = torch.full((20,), 0.6 * known, dtype=torch.float64) + scatter * known
+    few_right = torch.arange(20) < 4
+    assert factor(torch.where(few_right, known, most)) == pytest.approx(1 / 0.6, rel=0.01)
+    assert factor(torch.where(~few_right, known, most)) == 1  # the known length has the majority
+    assert factor(torch.where(torch.arange(20) < 9, known, most)) == 1  # not clearly outvoted
+    assert factor(alone * known) == 1  # no two agree
 
 
 @pytest.mark.parametrize("extent", [0.0, 1e-9, 1e300])

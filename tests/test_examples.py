@@ -18,7 +18,7 @@ def marked(example: Path) -> object:
     return pytest.param(example, id=example.stem, marks=[pytest.mark.slow] if example.stem in LONG else [])
 
 
-@pytest.mark.parametrize("example", map(marked, EXAMPLES))
+@pytest.mark.parametrize("example", list(map(marked, EXAMPLES)))
 def test_example_runs(example: Path, tmp_path: Path):
     alone = os.environ | {"OMP_NUM_THREADS": "1"}
     run = subprocess.run([sys.executable, str(example)], cwd=tmp_path, env=alone, capture_output=True, text=True, check=False)

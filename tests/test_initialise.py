@@ -11,14 +11,17 @@ import pytest
 import torch
 
 from torchstickcal import Observations, RigError, calibrate, errors, metrics
-from torchstickcal.config import InitialiseSettings
+from torchstickcal.config import InitialiseSettings, load_config
 from torchstickcal.model.measurements import Measurements
+from torchstickcal.model.state import State
+from torchstickcal.pipeline.adjust import adjust_cameras, begin
 from torchstickcal.pipeline.initialise import initialise
 from torchstickcal.pipeline.initialise.graph import Edge, propagate, spanning_tree
 from torchstickcal.pipeline.initialise.pairs import Pair, RelativePose, relate
 from torchstickcal.pipeline.initialise.triangulate import triangulate
 from torchstickcal.pipeline.initialise.views import Views
-from torchstickcal.simulate import Noise, SessionSpec, golf_session
+from torchstickcal.pipeline.run import Run
+from torchstickcal.simulate import Lens, Noise, SessionSpec, golf_session
 
 
 @pytest.mark.parametrize("cameras", [2, 3, 5])
@@ -138,3 +141,32 @@ def test_triangulation_is_exact_and_robust():
 
 def test_example_of_the_errors_runs():
     assert doctest.testmod(errors).failed == 0
+
+
+def test_depths_are_reversed_in_all_cameras_and_nothing_else():
+    case, truth = golf_session(cameras=4, frames=10)
+    assert truth.points is not None
+    points = truth.points.flatten(0, 1).mT[None].contiguous()
+    state = State.of(truth.rotations[None], truth.translations[None], points)
+    there = state.depth_reversed(Measurements.of(case).active)
+    before, after = state.in_cameras()[0], there.in_cameras()[0]
+    torch.testing.assert_close(after[:, :2], before[:, :2])
+    depths = (before + after)[:, 2]
+    torch.testing.assert_close(depths, depths[:, :1].expand_as(depths))
+    assert (after[:, 2] - before[:, 2]).abs().amax(1).min() > 0.3
+
+
+@pytest.mark.parametrize("seed", range(2))
+def test_a_start_with_reversed_depths_is_left(seed: int):
+    session = SessionSpec("s", "hockey", seed=seed, cameras=4, frames=30, layout="hemisphere", lens=Lens(), regimes=())
+    case = session.generate()
+    cameras, _, points, _ = case.observations.keypoints.shape
+    offsets = torch.randn(cameras, 1, points, 2, dtype=torch.float64, generator=torch.Generator().manual_seed(seed))
+    noisy = case.observations.keypoints + 6 * offsets
+    run = Run(load_config("default"))
+    begun = begin(replace(case.observations, keypoints=noisy), run)
+    begun = replace(begun, state=begun.state.depth_reversed(begun.measurements.active))
+    ended = adjust_cameras(begun, run)
+    found, truth = ended.state, case.truth
+    errors = metrics.pose_errors(found.rotations[0], found.translations[0], truth.rotations, truth.translations)
+    assert errors.mean_rotation_deg < 10  # on the wrong side it is more than 90

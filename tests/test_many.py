@@ -19,8 +19,18 @@ from typing import Any
 import pytest
 import torch
 
-from torchstickcal import CalibrationError, FileFormatError, Observations, Stick, calibrate, calibrate_many, load_config
+from torchstickcal import (
+    CalibrationError,
+    FileFormatError,
+    Observations,
+    ResultFiles,
+    Stick,
+    calibrate,
+    calibrate_many,
+    load_config,
+)
 from torchstickcal.cli import main
+from torchstickcal.cli.arguments import parser
 from torchstickcal.cli.calibrate_many import _Writing
 from torchstickcal.io import Given, write_npz
 from torchstickcal.many import SessionFile, SessionRow, read_manifests, session_files
@@ -175,8 +185,41 @@ def test_failures_are_rows_and_are_tried_again_only_if_that_is_asked_for(tmp_pat
             links.extend(value or "" for key, value in attrs if key == "href")
 
     Links().feed(page)
-    assert len(links) == 4
+    assert sorted(link.rpartition("/")[2] for link in links) == ["report.html", "report.html", "sessions.csv", "sessions.jsonl"]
     assert all((out / link).is_file() for link in links)
+
+
+def test_many_sessions_have_the_files_of_one(tmp_path: Path):
+    write_npz(tmp_path / "swing.npz", swing(0))
+    one = tmp_path / "one"
+    assert main(["calibrate", str(tmp_path / "swing.npz"), "--write", "trc,camera_array.toml", "--out", str(one)]) == 0
+    expected = {path.name for path in one.iterdir()}
+    assert {"report.html", "points.trc", "camera_array.toml"} <= expected
+    with ThreadPoolExecutor(1) as pool:
+        for page, linked in ((True, "report.html"), (False, "report.json")):
+            out, files = tmp_path / f"page {page}", ResultFiles(("trc", "camera_array.toml"), page=page)
+            calibrate_many({"swing": swing(0)}, refine="auto", executor=pool, out=out, write=files)
+            assert {path.name for path in (out / "results" / "swing").iterdir()} == expected - {"report.html"} | {linked}
+            assert f"results/swing/{linked}" in (out / "index.html").read_text()
+
+
+def test_the_command_can_leave_the_page_out():
+    command = ["calibrate-many", "sessions", "--out", "results"]
+    assert parser().parse_args(command).page
+    assert not parser().parse_args([*command, "--no-page"]).page
+
+
+@pytest.mark.parametrize(
+    ("formats", "error"),
+    [
+        (("nonsense",), "unknown output format"),
+        (("a/b.trc",), "another folder"),
+        (("report.html.trc", "POINTS.npz"), "one name"),
+    ],
+)
+def test_files_that_cannot_be_written_together_are_refused_before_anything_is_calculated(formats: tuple[str, ...], error: str):
+    with pytest.raises(CalibrationError, match=error):
+        ResultFiles(formats)
 
 
 # --- what is interrupted -----------------------------------------------------------------------------------------------------
@@ -252,12 +295,13 @@ def test_other_settings_need_another_folder(expected: tuple[Path, Any]):
 
 def test_the_code_of_the_settings_tells_what_changes_the_files():
     def code(config: Any = "default", refine: Any = None, path: str = "a.npz", stick: Any = None, **writing: Any) -> str:
-        write = _Writing(**{"config": "x", "write": None, "world": "camera", "units": None} | writing)
+        write = _Writing(**{"config": "x", "files": ResultFiles(), "world": "camera", "units": None} | writing)
         source = Source("a", SessionFile(path, given=None if stick is None else Given(Stick(0, 1, stick))))
         return Settings(load_config(config), refine, None, write, None).code_of(source)
 
-    others = [code("stick_only"), code(refine="auto"), code(stick=1.0), code(stick=1.1), code(world="floor"), code(write="trc")]
-    assert len({code(), *others}) == 7
+    others = [code("stick_only"), code(refine="auto"), code(stick=1.0), code(stick=1.1), code(world="floor")]
+    others += [code(files=ResultFiles(("trc",))), code(files=ResultFiles(page=False))]
+    assert len({code(), *others}) == 8
     assert code(path="b.npz") == code() == code({"extends": "default"})
 
 

@@ -52,13 +52,13 @@ def test_log_has_every_iteration_of_every_stage(logged: tuple[Calibration, Event
     for tag, values in {
         "solver/cost": [record.cost for record in records],
         "solver/damping": [record.damping for record in records],
-        "solver/step (m)": [record.step_m for record in records],
+        "solver/step [m]": [record.step_m for record in records],
         "solver/stage": stages,
-        "reprojection (px)/top": [record.reprojection_px[2] for record in records],
-        "stick/mean length (m)": [record.stick_length_m for record in records],
+        "reprojection [px]/top": [record.reprojection_px[2] for record in records],
+        "stick/mean length [m]": [record.stick_length_m for record in records],
         "loss/reprojection": [record.terms["reprojection"] for record in records],
-        "camera positions (m)/right_far x": [centre[0] for centre in centres],
-        "camera positions (m)/right_far z": [centre[2] for centre in centres],
+        "camera positions [m]/right_far x": [centre[0] for centre in centres],
+        "camera positions [m]/right_far z": [centre[2] for centre in centres],
     }.items():
         events = log.Scalars(tag)
         assert [event.value for event in events] == pytest.approx(values, rel=1e-5, abs=1e-7), tag
@@ -72,8 +72,8 @@ def test_log_has_the_result(logged: tuple[Calibration, EventAccumulator]):
     tags = log.Tags()
     assert tags["images"] == ["rig", "residuals"]
     assert set(tags["histograms"]) == {
-        *(f"residuals (px)/{name}" for name in ("left", "right_far", "top")),
-        "stick/length in each frame (m)",
+        *(f"residuals [px]/{name}" for name in ("left", "right_far", "top")),
+        "stick/length in each frame [m]",
     }
     assert {"results/text_summary", "warnings/text_summary", "scene_VERTEX", "scene_FACE", "scene_COLOR"} <= set(
         tags["tensors"]
@@ -82,13 +82,13 @@ def test_log_has_the_result(logged: tuple[Calibration, EventAccumulator]):
     assert b"right/far" in log.Tensors("results/text_summary")[0].tensor_proto.string_val[0]
     warnings = log.Tensors("warnings/text_summary")[0].tensor_proto.string_val[0].decode()
     assert warnings == f"converged\n\n- {calibration.warnings[0]}"
-    (std,) = log.Scalars("standard deviation (m)/top")
+    (std,) = log.Scalars("standard deviation [m]/top")
     assert std.value == pytest.approx(float(calibration.camera_std_m[2]), rel=1e-5)
     plugin = log.summary_metadata["_hparams_/session_start_info"].plugin_data.content
     made_of = HParamsPluginData.FromString(plugin).session_start_info.hparams
     assert made_of["cameras"].number_value == 3
     assert "metric" in made_of["stages"].string_value
-    (median,) = log.Scalars("final/reprojection, median (px)")
+    (median,) = log.Scalars("final/reprojection, median [px]")
     assert median.value == pytest.approx(float(calibration.reprojection_median_px.median()), rel=1e-5)
 
 
@@ -106,9 +106,18 @@ def test_rotations_are_drawn_without_jumps():
     for angle in angles:
         tangents = torch.stack([torch.zeros(6).double(), torch.cat([torch.zeros(3).double(), angle * axis])])
         scalars = log._poses(*se3.exp(tangents))
-        found.append([scalars[f"camera rotations (deg)/turning {name}"] for name in "xyz"])
+        found.append([scalars[f"camera rotations [deg]/turning {name}"] for name in "xyz"])
     expected = np.degrees(angles[:, None] * axis.numpy())
     np.testing.assert_allclose(found, expected, atol=1e-9)
+
+
+def test_no_tag_has_round_brackets_which_custom_scalars_do_not_draw(tmp_path: Path):
+    named = replace(OBSERVATIONS, camera_names=tuple(f"camera (no. {number})" for number in range(len(OBSERVATIONS.keypoints))))
+    calibrate(named, callback=TensorBoardMonitor(tmp_path, figures=False))
+    tags = read(tmp_path / "calibration_001").Tags()
+    for tag in (*tags["scalars"], *tags["histograms"]):
+        assert not {"(", ")"} & set(tag), tag
+    assert "reprojection [px]/camera [no. 1]" in tags["scalars"]
 
 
 def test_runs_do_not_mix(tmp_path: Path):
@@ -130,7 +139,7 @@ def test_the_command_line_writes_a_run_of_its_own(tmp_path: Path):
     for _ in range(2):
         assert main(["calibrate", str(session), "--out", str(tmp_path / "out"), "--tensorboard", str(tmp_path / "logs")]) == 0
     assert sorted(path.name for path in (tmp_path / "logs").iterdir()) == ["calibration_001", "calibration_002"]
-    assert "reprojection (px)/cam02" in read(tmp_path / "logs" / "calibration_001").Tags()["scalars"]
+    assert "reprojection [px]/cam02" in read(tmp_path / "logs" / "calibration_001").Tags()["scalars"]
 
 
 def test_an_iteration_is_one_entry_of_the_log():
@@ -170,11 +179,11 @@ def test_a_training_has_errors_shares_histograms_and_pictures(tmp_path: Path):
     errors = pose_errors(good.rotations, good.translations, TRUTH.rotations, TRUTH.translations)
     for tag, value in {
         "train/share of sessions calibrated": 2 / 3,
-        "train/position error (m)": float(errors.translation_m.mean()),
-        "train/rotation error (deg)": float(errors.rotation_deg.mean()),
-        "train position error (m)/right_far": float(errors.translation_m[:, 1].mean()),
+        "train/position error [m]": float(errors.translation_m.mean()),
+        "train/rotation error [deg]": float(errors.rotation_deg.mean()),
+        "train position error [m]/right_far": float(errors.translation_m[:, 1].mean()),
         "train/share of inliers": float(result.inliers[1:].sum() / OBSERVATIONS.keypoints.isfinite().all(-1).sum() / 2),
-        "test/position error (m)": float(errors.translation_m[0].mean()),
+        "test/position error [m]": float(errors.translation_m[0].mean()),
         "test/share of sessions calibrated": 1.0,
     }.items():
         events = log.Scalars(tag)
@@ -182,7 +191,7 @@ def test_a_training_has_errors_shares_histograms_and_pictures(tmp_path: Path):
         assert events[0].value == pytest.approx(value, rel=1e-5), tag
     assert [event.step for event in log.Histograms("train/confidence")] == [0, 2, 4]
     assert [event.step for event in log.Images("train/keypoints")] == [0, 2, 4]
-    assert "train residuals (px)/top" in log.Tags()["histograms"]
+    assert "train residuals [px]/top" in log.Tags()["histograms"]
     assert log.Scalars("loss")
 
 

@@ -119,7 +119,7 @@ def test_formats(plugin: str, session: Path, tmp_path: Path, capsys: pytest.Capt
     assert "no session format is recognised" not in capsys.readouterr().err
     command = ["calibrate", str(session), "--out", str(out), "--export", "toy_names", "--plugin", plugin]
     assert main(command) == 0
-    assert "calibration.toml, names.txt, points.npz, report.json in" in capsys.readouterr().out
+    assert "calibration.toml, names.txt, points.npz, report.json, report.html in" in capsys.readouterr().out
     assert (out / "names.txt").read_text() == "cam01 cam02 cam03"
     assert main([*command, "--format", "toy_session"]) == 0
     marked = tmp_path / "marked.txt"

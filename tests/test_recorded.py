@@ -25,7 +25,7 @@ def sequences(data: Path) -> tuple[Source, ...]:
     ("config", "rotation_deg", "translation_m"),
     [
         ("default", 1.02 * LIMIT_DEG, 1.03 * LIMIT_M),
-        ("lbfgs", 1.02 * LIMIT_DEG, 1.03 * LIMIT_M),
+        pytest.param("lbfgs", 1.02 * LIMIT_DEG, 1.03 * LIMIT_M, marks=pytest.mark.slow),
         ("paper", 1.1 * LIMIT_DEG, 1.1 * LIMIT_M),
         ("stick_only", 0.018, 0.001),
         ("human_only", 0.0062, 0.015),

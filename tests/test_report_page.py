@@ -218,5 +218,9 @@ def test_in_a_browser_the_slider_moves_everything_without_an_error_or_a_request(
 
         page.open(file, width=390, height=800)
         assert page.evaluate("document.documentElement.scrollWidth") == 390, "nothing is wider than a phone"
+
+        page.call("Emulation.setEmulatedMedia", media="print")
+        page.open(file, width=700, height=800)
+        assert page.evaluate("[...document.querySelectorAll('.wide')].every((one) => one.scrollWidth <= one.clientWidth)")
         assert page.errors == []
         assert set(page.requests) == {file.as_uri()}

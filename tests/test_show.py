@@ -170,3 +170,33 @@ def test_showing_imports_nothing_that_is_not_needed():
 @pytest.mark.parametrize("module", [look, skeleton, tables, packing, page])
 def test_examples_run(module: object):
     assert doctest.testmod(module).failed == 0  # pyright: ignore[reportArgumentType]
+
+
+@pytest.mark.parametrize("columns", [1, 40, 57, 80, 118, 300])
+@pytest.mark.parametrize("unit", ["%", "mm", "px", "deg", "ms"])
+def test_sentences_fit_into_the_terminal_and_numbers_keep_their_units(unit: str, columns: int, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setenv("COLUMNS", str(columns))
+    sentence = " ".join(f"about {number} {unit} of it" for number in range(40))
+    lines = look.wrapped(sentence, others="    ")
+    assert max(map(len, lines)) <= max(40, min(118, columns))
+    assert not any(re.match(rf"\s*{unit}", line) for line in lines)
+    assert " ".join(line.strip() for line in lines) == sentence
+
+
+def test_the_table_of_the_cameras_fits_into_80_columns(calibration: Calibration):
+    far = [facts._replace(centre_m=[-12.3456, 7.0, 123.4]) for facts in camera_facts(calibration)]
+    for facts, widest in ((camera_facts(calibration), 80), (far, 86)):
+        lines = camera_table(facts).text().splitlines()
+        assert max(map(len, lines)) <= widest
+        heads = " ".join(" ".join(line.split()) for line in lines[:4])
+        assert all(word in heads for word in ("position", "reprojection", "keypoints", "used", "share", "(px, median)"))
+
+
+def test_a_point_without_keypoints_has_no_noise(calibration: Calibration):
+    nothing = torch.zeros_like(calibration.inliers[..., :1])
+    inliers = torch.cat([nothing, calibration.inliers[..., 1:]], -1)
+    residuals = calibration.residuals_px.clone()
+    residuals[:, :, 0] = torch.nan
+    rows = tables.point_table(replace(calibration, inliers=inliers, residuals_px=residuals)).rows
+    assert rows[0][1:4] == ("-", "0", "-")
+    assert rows[1][1] != "-"

@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from torchstickcal.layer.result import LayerResult
     from torchstickcal.many import calibrate_many
     from torchstickcal.observations import Observations
+    from torchstickcal.outputs import ResultFiles
     from torchstickcal.pipeline.calibrate import Callback, calibrate
     from torchstickcal.pipeline.triangulate import triangulate
     from torchstickcal.quality.check import check
@@ -49,6 +50,7 @@ _HOMES = {
     "ObservationError": "errors",
     "Observations": "observations",
     "Reconstruction": "reconstruction",
+    "ResultFiles": "outputs",
     "Quality": "quality.verdict",
     "RigError": "errors",
     "Severity": "quality.finding",
@@ -84,6 +86,7 @@ __all__ = [
     "Observations",
     "Quality",
     "Reconstruction",
+    "ResultFiles",
     "RigError",
     "Severity",
     "Stick",

@@ -21,6 +21,11 @@ try:
 except ImportError:  # Windows
     fcntl = None
 
+CAMERAS_FILE, POINTS_FILE, REPORT_FILE, PAGE_FILE = "calibration.toml", "points.npz", "report.json", "report.html"
+"""The files of a result: its cameras, the saved calibration, what programs and what people read of it."""
+RERUN_FILE = "scene.rrd"
+"""A recording for the Rerun viewer, of results for which it is asked."""
+
 _TEMPORARY = ".torchstickcal-"
 _CANNOT_SYNC = {errno.EINVAL, errno.ENOTSUP, errno.ENOSYS, errno.EBADF}
 """What file systems without fsync, or without fsync of folders, answer."""
@@ -146,6 +151,12 @@ def json_text(content: Any, indent: int | None = 2) -> str:
         }
     """
     return json.dumps(without_nan(content), indent=indent, allow_nan=False)
+
+
+def write_json(path: str | Path, content: Any) -> None:
+    """Write a file of JSON, as :func:`json_text` has it."""
+    with atomic_path(path) as temporary:
+        temporary.write_text(json_text(content) + "\n", "utf-8")
 
 
 def parse_toml(content: bytes) -> dict[str, Any]:

@@ -6,6 +6,7 @@ import dataclasses
 import json
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -72,23 +73,48 @@ class CameraParameter:
     given: Tensor
     prior_std: Tensor
     """standard deviation around the given value before anything was seen"""
-    suggested: Tensor
-    """what the keypoints suggest, to first order, if this alone is changed; near ``value`` where it was estimated"""
-    suggested_std: Tensor
+    suggestion: tuple[Tensor, Tensor] | Callable[[], tuple[Tensor, Tensor]] = field(repr=False)
+    """what the keypoints suggest, and its standard deviation, or what gives them when they are first asked for"""
+
+    @property
+    def suggested(self) -> Tensor:
+        """What the keypoints suggest, to first order, if this alone is changed; near ``value`` where it was estimated."""
+        return self._suggestion[0]
+
+    @property
+    def suggested_std(self) -> Tensor:
+        """Standard deviation of what the keypoints suggest."""
+        return self._suggestion[1]
 
     def to(self, dtype: torch.dtype) -> CameraParameter:
         """The same in another floating-point type."""
-        return dataclasses.replace(self, **{name: getattr(self, name).to(dtype).contiguous() for name in _PARAMETER_TENSORS})
+        tensors = {name: getattr(self, name).to(dtype).contiguous() for name in _PARAMETER_TENSORS}
+        return dataclasses.replace(self, **tensors, suggestion=partial(_converted, self, dtype))
 
     def by_component(self, name: str) -> Tensor:
         """One of the tensors as (C, n), whatever n is."""
         tensor: Tensor = getattr(self, name)
         return tensor.view(len(tensor), -1)
 
+    @cached_property
+    def _suggestion(self) -> tuple[Tensor, Tensor]:
+        found = self.suggestion() if callable(self.suggestion) else self.suggestion
+        object.__setattr__(self, "suggestion", found)  # what it was computed from need not be kept
+        return found
+
+    def __getstate__(self) -> dict[str, Any]:
+        """What is copied and sent to other processes: the suggestion itself, not what gives it."""
+        return self.__dict__ | {"suggestion": self._suggestion}
+
+
+def _converted(parameter: CameraParameter, dtype: torch.dtype) -> tuple[Tensor, Tensor]:
+    return parameter.suggested.to(dtype).contiguous(), parameter.suggested_std.to(dtype).contiguous()
+
 
 _CAMERA_WORLD = World()
 _UNKNOWN = "unknown_"
-_PARAMETER_TENSORS = ("value", "std", "given", "prior_std", "suggested", "suggested_std")
+_PARAMETER_TENSORS = ("value", "std", "given", "prior_std")
+_SAVED_TENSORS = (*_PARAMETER_TENSORS, "suggested", "suggested_std")
 
 
 VIEWS: Registry[Callable[..., Any]] = Registry("view of a calibration", "torchstickcal.show.views")
@@ -398,7 +424,7 @@ class Calibration:
         tensors = {name: getattr(self, name) for name in (*_TENSORS, *_OPTIONAL_TENSORS)}
         arrays = {name: tensor.detach().cpu().numpy() for name, tensor in tensors.items() if tensor is not None}
         for name, parameter in self.unknowns.items():
-            values = (getattr(parameter, field).detach() for field in _PARAMETER_TENSORS)
+            values = (getattr(parameter, field).detach() for field in _SAVED_TENSORS)
             arrays[f"{_UNKNOWN}{name}"] = torch.stack(list(values)).cpu().numpy()
         meta = {
             "format": _FORMAT,
@@ -474,15 +500,19 @@ def _tensor(arrays: Mapping[str, Any], name: str) -> Tensor:
 
 def _parameter(arrays: Mapping[str, Any], name: str, about: dict[str, Any], cameras: int) -> CameraParameter:
     values = _tensor(arrays, f"{_UNKNOWN}{name}")
-    if values.shape[:2] != (len(_PARAMETER_TENSORS), cameras):
+    if values.shape[:2] != (len(_SAVED_TENSORS), cameras):
         raise ValueError(f"{name} has the shape {tuple(values.shape)}")
-    tensors = dict(zip(_PARAMETER_TENSORS, values, strict=True))
+    value, std, given, prior_std, suggested, suggested_std = values
     return CameraParameter(
         _checked(about["label"], str),
         _checked(about["unit"], str),
         _texts(about["components"]),
         _checked(about["refined"], bool),
-        **tensors,
+        value,
+        std,
+        given,
+        prior_std,
+        suggestion=(suggested, suggested_std),
     )
 
 

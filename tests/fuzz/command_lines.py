@@ -85,6 +85,7 @@ VALUES: dict[str, list[str] | None] = {
     "--split-moved": None,
     "--strict": None,
     "--verbose": None,
+    "--rrd": None,
     "--to": ["anipose", "trc", "x", ""],
     "--sport": ["golf", "x", ""],
     "--up": ["0 0 1", "0 0 0", "nan 0 1", "x y z"],
@@ -96,6 +97,7 @@ VALUES: dict[str, list[str] | None] = {
     "--shard": ["1/2", "3/2", "x", ""],
     "--memory": ["8GB", "1", "x", ""],
     "--retry": None,
+    "--no-page": None,
 }
 """The values that are tried of each option, words separated by blanks; None for an option without one. What would take long is
 left out."""
@@ -120,7 +122,7 @@ FITTING = {
     "calibrate": [
         *("--format", "--export", "--config", "--refine", "--no-sync", "--stick-length", "--stick-sigma", "--plugin"),
         *("--stick", "--stick-points", "--intrinsics", "--image-size", "--fps", "--skeleton", "--person"),
-        *("--write", "--world", "--initial", "--turned", "--split-moved", "--strict", "--verbose"),
+        *("--write", "--world", "--initial", "--turned", "--split-moved", "--strict", "--verbose", "--rrd"),
     ],
     "evaluate": ["--format", "--json", "--plugin", "--units"],
     "simulate": ["--seed", "--plugin"],
@@ -131,7 +133,7 @@ FITTING = {
     "info": ["--json"],
     "convert": ["--to", "--from", "--units"],
     "sample": [],
-    "report": [],
+    "report": ["--rrd"],
     "analyse": ["--sport", "--up", "--fps"],
     "detect": ["--tape", "--weights", "--rtmlib"],
 }

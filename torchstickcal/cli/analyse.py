@@ -8,8 +8,9 @@ from math import isfinite
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from torchstickcal.cli.outputs import EXIT_DONE, POINTS_FILE, point_writers
+from torchstickcal.cli.outputs import EXIT_DONE, point_writers
 from torchstickcal.errors import CalibrationError
+from torchstickcal.files import POINTS_FILE
 
 if TYPE_CHECKING:
     from torchstickcal.reconstruction import Reconstruction

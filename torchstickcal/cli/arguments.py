@@ -94,6 +94,7 @@ def _add_calibrate(commands: Any) -> None:
     )
     _add_units(command)
     command.add_argument("--tensorboard", metavar="DIR", type=_path, help="write a TensorBoard log of the calibration")
+    _add_rrd(command)
     command.add_argument(
         "--split-moved", action="store_true", help="if a camera moved, calibrate again with its places before and after as two"
     )
@@ -111,6 +112,7 @@ def _add_report(commands: Any) -> None:
         description="Write report.html, a page that shows the result, into a folder that `calibrate` wrote.",
     )
     command.add_argument("folder", metavar="DIR", type=_path, help="folder that `calibrate` wrote")
+    _add_rrd(command)
     command.set_defaults(run=report, plugin=())
 
 
@@ -163,6 +165,8 @@ def _add_calibrate_many(commands: Any) -> None:
     _add_config(command)
     _add_refining(command)
     _add_write(command, "each calibration and its points also")
+    _add_rrd(command, " for each session")
+    add("--no-page", dest="page", action="store_false", help="do not write report.html for each session")
     _add_world(command)
     _add_units(command)
     _add_plugin(command)
@@ -329,6 +333,11 @@ def _add_list(commands: Any) -> None:
 def _add_out(command: argparse.ArgumentParser, what: str) -> None:
     help = f"folder for the {what}; created if it does not exist"
     command.add_argument("--out", metavar="DIR", type=_path, required=True, help=help)
+
+
+def _add_rrd(command: argparse.ArgumentParser, of_each: str = "") -> None:
+    help = f"write scene.rrd{of_each}, a recording for the Rerun viewer (needs torchstickcal[rerun])"
+    command.add_argument("--rrd", action="store_true", help=help)
 
 
 def _add_strict(command: argparse.ArgumentParser) -> None:

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from torchstickcal.cli.detect import session_in
-from torchstickcal.cli.outputs import check_frame_rate, chosen_writers, result_names, show_results, write_results
+from torchstickcal.cli.outputs import chosen_files, show_results
 from torchstickcal.cli.world import placed, world_of
 from torchstickcal.errors import CalibrationError
 
@@ -27,12 +27,13 @@ def calibrate_session(options: argparse.Namespace) -> int:
     from torchstickcal.config import load_config
     from torchstickcal.files import atomic_set, try_writing
     from torchstickcal.io import load_session
+    from torchstickcal.outputs import check_frame_rate
     from torchstickcal.pipeline.calibrate import calibrate
 
     config, refine = refining(load_config(options.config), options.refine, options.no_sync)
-    writers, world = chosen_writers(options.write), world_of(options.world, options.units)
+    files, world = chosen_files(options.write, rerun=options.rrd), world_of(options.world, options.units)
     initial = initial_of(options.initial)
-    try_writing(options.out, result_names(writers))
+    try_writing(options.out, files.single_files)
     if options.tensorboard is not None:
         try_writing(options.tensorboard, where="--tensorboard")
     given = given_of(options)
@@ -40,7 +41,7 @@ def calibrate_session(options: argparse.Namespace) -> int:
     for note in session.notes:
         print(f"note: {note}", file=sys.stderr)
     observations = with_stick(session.observations, options.stick_length, options.stick_sigma)
-    check_frame_rate(writers, observations)
+    check_frame_rate(files.writers, observations)
     calibration = calibrate(observations, config, Progress(_monitor(options.tensorboard)), refine, initial=initial)
     if options.split_moved and (split := _split(observations, calibration)) is not None:
         calibration = calibrate(split, config, Progress(_monitor(options.tensorboard)), refine)
@@ -48,8 +49,8 @@ def calibrate_session(options: argparse.Namespace) -> int:
     for sentence in sentences:
         print(f"note: {sentence}", file=sys.stderr)
     with atomic_set(options.out) as folder:
-        write_results(calibration, folder, writers, _provenance(options, config, [*session.notes, *sentences]))
-    return show_results(calibration, options.out, writers, options.strict, options.verbose)
+        files(calibration, folder, _provenance(options, config, [*session.notes, *sentences]))
+    return show_results(calibration, options.out, files, options.strict, options.verbose)
 
 
 def _split(observations: Observations, calibration: Calibration) -> Observations | None:

@@ -14,7 +14,7 @@ from textwrap import shorten
 from typing import TYPE_CHECKING, Any
 
 from torchstickcal.cli.calibrate import given_of, refining, with_stick
-from torchstickcal.cli.outputs import EXIT_DONE, EXIT_NOT_CONVERGED, chosen_writers, write_results
+from torchstickcal.cli.outputs import EXIT_DONE, EXIT_NOT_CONVERGED, chosen_files
 from torchstickcal.cli.plugins import import_plugins
 from torchstickcal.cli.world import placed, world_of
 from torchstickcal.errors import CalibrationError
@@ -22,6 +22,7 @@ from torchstickcal.errors import CalibrationError
 if TYPE_CHECKING:
     from torchstickcal.many import SessionRow
     from torchstickcal.observations import Observations
+    from torchstickcal.outputs import ResultFiles
     from torchstickcal.result import Calibration
 
 _UNITS = {"": 1, "K": 10**3, "M": 10**6, "G": 10**9, "T": 10**12, "Ki": 2**10, "Mi": 2**20, "Gi": 2**30, "Ti": 2**40}
@@ -34,12 +35,13 @@ def calibrate_sessions(options: argparse.Namespace) -> int:
     from torchstickcal.many import calibrate_many, session_files
     from torchstickcal.many.cluster import cluster_executor
     from torchstickcal.many.manifest import CONVERGED, FAILED
-    from torchstickcal.many.tables import PAGE_FILE
+    from torchstickcal.many.tables import INDEX_FILE
 
     config, refine = refining(load_config(options.config), options.refine, options.no_sync)
     memory_bytes, shard = _bytes(options.memory), _shard(options.shard)
-    writing = _Writing(options.config, options.write, _with_whole_path(options.world), options.units)
-    writing.check()
+    world_of(options.world, options.units)
+    files = chosen_files(options.write, options.page, options.rrd)
+    writing = _Writing(options.config, files, _with_whole_path(options.world), options.units)
     given = given_of(options)
     for name in ("intrinsics", "skeleton"):  # files, which processes elsewhere must find too
         file = getattr(given, name)
@@ -68,8 +70,8 @@ def calibrate_sessions(options: argparse.Namespace) -> int:
     for row in failed[:_SHOWN_FAILURES]:
         print(f"failed: {row.name}: {shorten(str(row.error), _LONGEST_ERROR, placeholder='...')}", file=sys.stderr)
     if len(failed) > _SHOWN_FAILURES:
-        print(f"failed: {len(failed) - _SHOWN_FAILURES} more; {options.out / PAGE_FILE} says why", file=sys.stderr)
-    print(f"{converged} of {len(done.rows)} converged, {len(failed)} failed; {options.out / PAGE_FILE} shows all")
+        print(f"failed: {len(failed) - _SHOWN_FAILURES} more; {options.out / INDEX_FILE} says why", file=sys.stderr)
+    print(f"{converged} of {len(done.rows)} converged, {len(failed)} failed; {options.out / INDEX_FILE} shows all")
     return EXIT_DONE if converged == len(done.rows) else EXIT_NOT_CONVERGED
 
 
@@ -89,25 +91,16 @@ class _Writing:
     """Writes the files that `calibrate` writes with the same options."""
 
     config: str
-    write: str | None
+    files: ResultFiles
     world: str
     units: str | None
-
-    def check(self) -> None:
-        """Refuse options that cannot be followed, before anything is calculated.
-
-        Raises:
-            CalibrationError: if there are any.
-        """
-        chosen_writers(self.write)
-        world_of(self.world, self.units)
 
     def __call__(self, calibration: Calibration, folder: Path, provenance: dict[str, Any]) -> None:
         calibration, sentences = placed(calibration, world_of(self.world, self.units))
         provenance = provenance | {"config": self.config}
         if notes := [*provenance.get("notes", ()), *sentences]:
             provenance["notes"] = notes
-        write_results(calibration, folder, chosen_writers(self.write), provenance)
+        self.files(calibration, folder, provenance)
 
 
 def _with_whole_path(world: str) -> str:

@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING
 
 from torchstickcal.cli.calibrate import given_of
 from torchstickcal.cli.evaluate import poses_of
-from torchstickcal.cli.outputs import POINTS_FILE, exit_status, show_quality, try_json, write_json
+from torchstickcal.cli.outputs import exit_status, show_quality, try_json, write_json
+from torchstickcal.files import POINTS_FILE
 
 if TYPE_CHECKING:
     from torchstickcal.quality.check import OldRig

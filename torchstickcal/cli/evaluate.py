@@ -6,8 +6,9 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from torchstickcal.cli.outputs import CAMERAS_FILE, EXIT_DONE, errors_by_camera, print_errors, try_json, write_json
+from torchstickcal.cli.outputs import EXIT_DONE, errors_by_camera, print_errors, try_json, write_json
 from torchstickcal.errors import CalibrationError
+from torchstickcal.files import CAMERAS_FILE
 
 if TYPE_CHECKING:
     from torchstickcal.io import Truth

@@ -1,46 +1,55 @@
-"""What the commands write and show of a calibration and of its errors, and their exit statuses."""
+"""What the commands show of a calibration and of its errors, and their exit statuses."""
 
 from __future__ import annotations
 
 import sys
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from torchstickcal import files as written
 from torchstickcal.cli.console import print_coloured
 from torchstickcal.errors import CalibrationError
+from torchstickcal.files import PAGE_FILE, REPORT_FILE
 
 if TYPE_CHECKING:
     from torchstickcal.io import Writer
     from torchstickcal.metrics import PoseErrors
-    from torchstickcal.observations import Observations
+    from torchstickcal.outputs import ResultFiles
     from torchstickcal.quality.verdict import Quality
     from torchstickcal.result import Calibration
 
 EXIT_DONE, EXIT_NOT_CONVERGED, EXIT_UNUSABLE, EXIT_POOR, EXIT_INTERRUPTED = 0, 1, 2, 3, 130
-CAMERAS_FORMAT = "pose2sim"
-CAMERAS_FILE, POINTS_FILE, REPORT_FILE, PAGE_FILE = "calibration.toml", "points.npz", "report.json", "report.html"
 
 
-def chosen_writers(names: str | None = None) -> dict[str, Writer]:
-    """The writers of the camera file and of further outputs, by the names of the files (or folders) that they write.
+def chosen_files(formats: str | None = None, page: bool = True, rerun: bool = False) -> ResultFiles:
+    """The files of a result that options ask for.
 
     Args:
-        names: of formats, or of files whose names say their formats, with commas.
+        formats: further formats, or files whose names say their formats, with commas.
+        page: whether ``report.html`` is written.
+        rerun: whether ``scene.rrd`` is written.
 
     Raises:
-        CalibrationError: for an unknown format, or if two files have the same name.
+        ConfigError: for an unknown format.
+        CalibrationError: if two files have the same name, or if Rerun is not installed.
     """
-    return _distinct([CAMERAS_FORMAT, *(names.split(",") if names else ())], {POINTS_FILE, REPORT_FILE, PAGE_FILE})
+    from torchstickcal.outputs import ResultFiles, result_writers
+
+    named = tuple(formats.split(",")) if formats else ()
+    result_writers(named, "--write")
+    return ResultFiles(named, page, rerun)
 
 
 def point_writers(names: str | None) -> dict[str, Writer]:
-    """The writers of points, as :func:`chosen_writers`; that of arrays where none are named.
+    """The writers of points, by the names of their files; that of arrays where none are named.
 
     Raises:
         CalibrationError: also for a format that does not hold points.
     """
-    writers = _distinct(names.split(",") if names else ["npz"], {REPORT_FILE})
+    from torchstickcal.outputs import named_writers
+
+    writers = named_writers(names.split(",") if names else ["npz"], {REPORT_FILE}, "--write")
     for name, writer in writers.items():
         if writer.writes != "points":
             raise CalibrationError(
@@ -49,93 +58,15 @@ def point_writers(names: str | None) -> dict[str, Writer]:
     return writers
 
 
-def _distinct(names: Iterable[str], taken: set[str]) -> dict[str, Writer]:
-    """Writers of formats or files, by the names of their files. One that is named twice counts once.
-
-    Raises:
-        CalibrationError: for an unknown format, for a file elsewhere, or if two files have the same name.
-    """
-    from torchstickcal.cli.convert import writer_of
-    from torchstickcal.io import CALIBRATION_WRITERS
-
-    writers: dict[str, Writer] = {}
-    for name in dict.fromkeys(names):
-        if name not in CALIBRATION_WRITERS and "." in name:
-            if Path(name).name != name:
-                expected = "the name of a file alone, which is written to the folder of the results"
-                raise CalibrationError("a file in another folder", where="--write", got=name, expected=expected)
-            file_name, writer = writer_of(name)
-        else:
-            writer = CALIBRATION_WRITERS[name]
-            file_name = writer.file_name
-        if file_name.lower() in {other.lower() for other in (*writers, *taken)}:
-            expected = "another file name"
-            raise CalibrationError("two files of one name", where=f"--write {name}", got=file_name, expected=expected)
-        writers[file_name] = writer
-    return writers
-
-
-def check_frame_rate(writers: dict[str, Writer], observations: Observations) -> None:
-    """Refuse, before anything is calculated, a recording without a frame rate for formats that need one.
-
-    Raises:
-        CalibrationError: if it is one.
-    """
-    if observations.fps is not None or observations.timestamps is not None:
-        return
-    for name, writer in writers.items():
-        if writer.needs_rate:
-            raise CalibrationError(
-                "a format that needs a frame rate",
-                where=name,
-                got="a recording without one",
-                expected="frames per second",
-                remedy="Give it with --fps.",
-            )
-
-
-def result_names(writers: dict[str, Writer]) -> list[str]:
-    """The names of the single files that :func:`write_results` writes; folders of several files are not among them."""
-    return [*(name for name, writer in writers.items() if not writer.files), POINTS_FILE, REPORT_FILE, PAGE_FILE]
-
-
-def write_results(calibration: Calibration, folder: Path, writers: dict[str, Writer], provenance: dict[str, Any]) -> None:
-    """Write the results of a calibration into a folder of :func:`torchstickcal.files.atomic_set`.
-
-    Args:
-        calibration: what was found.
-        folder: where.
-        writers: of the camera file and of further formats, by the names of their files.
-        provenance: the session, the configuration and notes, as JSON can hold them.
-    """
-    from torchstickcal.show.page.page import report_page
-
-    made_of = provenance | {"versions": versions()}
-    for file_name, writer in writers.items():
-        writer.write(folder / file_name, calibration)
-    calibration.save(folder / POINTS_FILE)
-    write_json(folder / REPORT_FILE, made_of | calibration.summary())
-    (folder / PAGE_FILE).write_text(report_page(calibration, made_of), "utf-8")
-
-
-def versions() -> dict[str, str]:
-    """The versions of what calculates."""
-    import platform
-    from importlib.metadata import version
-
-    packages = ("torchstickcal", "torch", "kornia", "numpy")
-    return {name: version(name) for name in packages} | {"python": platform.python_version()}
-
-
 def show_results(
-    calibration: Calibration, folder: Path, writers: dict[str, Writer], strict: bool = False, verbose: bool = False
+    calibration: Calibration, folder: Path, files: ResultFiles, strict: bool = False, verbose: bool = False
 ) -> int:
     """Show a calibration: the verdict first, then the tables, and where the files are.
 
     Args:
         calibration: what was found.
         folder: where its files are.
-        writers: that wrote them.
+        files: which there are.
         strict: whether ``usable`` counts as poor.
         verbose: whether every table is shown.
 
@@ -146,7 +77,7 @@ def show_results(
 
     show_quality(calibration.quality)
     print(f"\n{table(calibration, verbose)}")
-    print(f"\n{', '.join([*writers, POINTS_FILE, REPORT_FILE, PAGE_FILE])} in {folder}")
+    print(f"\n{', '.join(files.names)} in {folder}")
     print(f"Open {folder / PAGE_FILE} in a browser to see the result." + ("" if verbose else " More tables: --verbose."))
     if not calibration.converged:
         print(f"not converged: {calibration.status}", file=sys.stderr)
@@ -194,11 +125,9 @@ def print_errors(errors: dict[str, Any]) -> None:
 
 
 def write_json(path: Path | None, content: dict[str, Any]) -> None:
-    from torchstickcal.files import atomic_path, json_text
-
+    """Write what ``--json`` asks for, if it does."""
     if path is not None:
-        with atomic_path(path) as temporary:
-            temporary.write_text(json_text(content) + "\n", "utf-8")
+        written.write_json(path, content)
 
 
 def try_json(path: Path | None) -> None:

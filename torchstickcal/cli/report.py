@@ -6,7 +6,8 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from torchstickcal.cli.outputs import EXIT_DONE, PAGE_FILE, POINTS_FILE, REPORT_FILE
+from torchstickcal.cli.outputs import EXIT_DONE
+from torchstickcal.files import PAGE_FILE, POINTS_FILE, REPORT_FILE, RERUN_FILE
 
 if TYPE_CHECKING:
     from torchstickcal.result import Calibration
@@ -14,17 +15,21 @@ if TYPE_CHECKING:
 
 def report(options: argparse.Namespace) -> int:
     """Write the page of saved results."""
-    from torchstickcal.files import atomic_path, try_writing
+    from torchstickcal.files import try_writing
+    from torchstickcal.outputs import write_page
     from torchstickcal.result import Calibration
-    from torchstickcal.show.page.page import report_page
+    from torchstickcal.show.rerun import rerun_package, write_rerun
 
     folder: Path = options.folder
+    if options.rrd:
+        rerun_package()
     calibration = Calibration.load(folder / POINTS_FILE)
-    try_writing(folder, [PAGE_FILE], where="report")
-    page = report_page(calibration, _made_of(folder / REPORT_FILE, calibration))
-    with atomic_path(folder / PAGE_FILE) as temporary:
-        temporary.write_text(page, "utf-8")
+    try_writing(folder, [PAGE_FILE, *([RERUN_FILE] if options.rrd else [])], where="report")
+    write_page(folder / PAGE_FILE, calibration, _made_of(folder / REPORT_FILE, calibration))
     print(f"{folder / PAGE_FILE}: open it in a browser")
+    if options.rrd:
+        write_rerun(folder / RERUN_FILE, calibration)
+        print(f"{folder / RERUN_FILE}: open it with the command `rerun`")
     return EXIT_DONE
 
 

@@ -8,13 +8,12 @@ import sys
 from torchstickcal.cli.calibrate import Progress
 from torchstickcal.cli.outputs import (
     EXIT_DONE,
-    chosen_writers,
+    chosen_files,
     errors_by_camera,
     print_errors,
-    result_names,
     show_results,
-    write_results,
 )
+from torchstickcal.cli.world import placed, world_of
 
 
 def simulate(options: argparse.Namespace) -> int:
@@ -45,18 +44,18 @@ def demo(options: argparse.Namespace) -> int:
     from torchstickcal.show.rig import rig_figure
     from torchstickcal.simulate import Noise, golf_session
 
-    writers = chosen_writers()
-    try_writing(options.out, ["session.npz", "rig.png", *result_names(writers)])
+    files = chosen_files()
+    try_writing(options.out, ["session.npz", "rig.png", *files.single_files])
     print(
         "A golf swing seen by 6 cameras: 240 frames, 1.5 px noise, 15 % of the keypoints missing, 5 % wrong by up to 150 px.\n"
     )
     observations, truth = golf_session(noise=Noise(sigma_px=1.5, missing=0.15, outliers=0.05), seed=options.seed)
-    calibration = calibrate(observations, callback=Progress(None))
+    calibration, _ = placed(calibrate(observations, callback=Progress(None)), world_of("athlete"))
     with atomic_set(options.out) as folder:
         write_npz(folder / "session.npz", observations, truth)
-        write_results(calibration, folder, writers, {"session": str(options.out / "session.npz"), "config": "default"})
+        files(calibration, folder, {"session": str(options.out / "session.npz"), "config": "default"})
         rig_figure(calibration).savefig(folder / "rig.png", format="png", dpi=120)
-    status = show_results(calibration, options.out, writers)
+    status = show_results(calibration, options.out, files)
     print(f"picture in {options.out / 'rig.png'}\n\nAgainst the truth:")
     errors = pose_errors(calibration.rotations, calibration.translations, truth.rotations, truth.translations)
     print_errors(errors_by_camera(calibration.camera_names, errors))

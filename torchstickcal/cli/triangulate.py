@@ -9,9 +9,8 @@ from typing import Any
 
 from torchstickcal.cli.analyse import write_analysis
 from torchstickcal.cli.calibrate import given_of
-from torchstickcal.cli.outputs import EXIT_DONE, check_frame_rate, point_writers, write_json
-
-_REPORT = "report.json"
+from torchstickcal.cli.outputs import EXIT_DONE, point_writers, write_json
+from torchstickcal.files import REPORT_FILE
 
 
 def triangulate_session(options: argparse.Namespace) -> int:
@@ -19,13 +18,14 @@ def triangulate_session(options: argparse.Namespace) -> int:
     from torchstickcal.files import atomic_set, try_writing
     from torchstickcal.io import Motion, Rig, load_session
     from torchstickcal.io.results import read_result
+    from torchstickcal.outputs import check_frame_rate
     from torchstickcal.pipeline.triangulate import triangulate
     from torchstickcal.show.reconstruction import summary, table
 
     config = load_config(options.config)
     config = replace(config, synchronise=False) if options.no_sync else config
     writers = point_writers(options.write)
-    try_writing(options.out, [*writers, _REPORT])
+    try_writing(options.out, [*writers, REPORT_FILE])
     calibration = read_result(options.calibration)
     if isinstance(calibration, Rig):
         calibration = calibration.in_metres(options.units if calibration.unit is None else None)
@@ -40,9 +40,9 @@ def triangulate_session(options: argparse.Namespace) -> int:
     with atomic_set(options.out) as folder:
         for name, writer in writers.items():
             writer.write(folder / name, Motion.of(found))
-        write_json(folder / _REPORT, _provenance(options, list(session.notes)) | summary(found))
+        write_json(folder / REPORT_FILE, _provenance(options, list(session.notes)) | summary(found))
     print(table(found))
-    print(f"\n{', '.join([*writers, _REPORT])} in {options.out}")
+    print(f"\n{', '.join([*writers, REPORT_FILE])} in {options.out}")
     if options.analyse is not None:
         print()
         write_analysis(found, options.out / "analysis", options.analyse, "c3d" if "points.c3d" in writers else None)

@@ -5,13 +5,11 @@ from __future__ import annotations
 import zipfile
 from pathlib import Path
 
+from torchstickcal.files import CAMERAS_FILE, POINTS_FILE
 from torchstickcal.io.formats import is_folder, read_calibration
 from torchstickcal.io.rig import Rig
 from torchstickcal.result import Calibration
 from torchstickcal.untrusted import reading
-
-SAVED_FILE, CAMERAS_FILE = "points.npz", "calibration.toml"
-"""What ``torchstickcal calibrate`` calls its files: the saved calibration, and its cameras."""
 
 
 def read_result(path: str | Path, format: str | None = None) -> Calibration | Rig:
@@ -40,7 +38,7 @@ def read_result(path: str | Path, format: str | None = None) -> Calibration | Ri
     if format is not None:
         return read_calibration(path, format)
     if is_folder(path):
-        for file in (SAVED_FILE, CAMERAS_FILE):
+        for file in (POINTS_FILE, CAMERAS_FILE):
             if (path / file).is_file():
                 return read_result(path / file)
     return Calibration.load(path) if _is_saved(path) else read_calibration(path)

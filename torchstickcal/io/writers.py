@@ -91,6 +91,9 @@ class Writer:
 CALIBRATION_WRITERS: Registry[Writer] = Registry("output format", "torchstickcal.io")
 """The formats that can be written, by name. :func:`calibration_writer`, :func:`camera_writer`, :func:`point_writer` add one."""
 
+_SUFFIXES = {".trc": "trc", ".c3d": "c3d", ".csv": "csv", ".npz": "npz", ".toml": "pose2sim", ".py": "blender"}
+"""The format of a file by the end of its name, where its whole name says nothing else."""
+
 _Function = TypeVar("_Function", bound=Callable[..., None])
 
 
@@ -174,6 +177,30 @@ def write_calibration(path: str | Path, calibration: Calibration | Rig | Motion,
         (('cam01', 'cam02', 'cam03'), torch.Size([3, 3]))
     """
     CALIBRATION_WRITERS[format].write(path, calibration)
+
+
+def writer_of(file_name: str, format: str | None = None, where: str = "--write") -> tuple[str, Writer]:
+    """A file's name and its writer, by the name of the format, else by that of the file.
+
+    Raises:
+        CalibrationError: if nothing says which format it is.
+    """
+    if format is not None:
+        return file_name, CALIBRATION_WRITERS[format]
+    for writer in CALIBRATION_WRITERS.values():
+        if writer.file_name == file_name:
+            return file_name, writer
+    suffix = Path(file_name).suffix.lower()
+    if suffix in _SUFFIXES:
+        return file_name, CALIBRATION_WRITERS[_SUFFIXES[suffix]]
+    known = ", ".join(f"{writer.file_name} ({name})" for name, writer in CALIBRATION_WRITERS.items())
+    raise CalibrationError(
+        "the format of a file to be written is not known",
+        where=where,
+        got=file_name,
+        expected=f"a name that says it, such as {known}",
+        remedy="Say it with --to." if where == "TARGET" else "",
+    )
 
 
 def file_names(names: Sequence[str]) -> list[str]:

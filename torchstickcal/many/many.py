@@ -13,12 +13,13 @@ from typing import Any, Literal
 
 from torchstickcal.config import Config, Refine, load_config
 from torchstickcal.errors import CalibrationError, ConfigError, quoted
-from torchstickcal.files import try_writing
+from torchstickcal.files import POINTS_FILE, try_writing
 from torchstickcal.many.engine import on_executor, on_processes
 from torchstickcal.many.manifest import FAILED, SessionRow, manifest_name, open_manifest, read_manifests
 from torchstickcal.many.sources import SessionLike, Source, sources_of
 from torchstickcal.many.tables import FILES, write_tables
-from torchstickcal.many.task import POINTS_FILE, Settings, Task, Write, write_files
+from torchstickcal.many.task import Settings, Task, Write
+from torchstickcal.outputs import ResultFiles
 from torchstickcal.result import Calibration
 
 _MOST_PER_PROCESSOR = 8
@@ -67,7 +68,7 @@ def calibrate_many(
     memory_bytes: int | None = None,
     shard: tuple[int, int] | None = None,
     retry: bool = False,
-    write: Write = write_files,
+    write: Write | None = None,
     prepare: Callable[[], object] | None = None,
     progress: Progress | None = None,
 ) -> ManyCalibrations:
@@ -90,8 +91,9 @@ def calibrate_many(
         shard: ``(i, n)``, from ``(1, n)`` to ``(n, n)``, for every n-th session only: the rest is done by other calls with the
             same sessions in the same order, on other machines.
         retry: whether sessions that failed are tried again.
-        write: called with a calibration, a folder, and a dictionary that says of what session it is; writes the files. Where it
-            has options, it is a dataclass: its ``repr`` tells one choice of them from another.
+        write: writes the files of each session; None for ``ResultFiles()``, all that ``calibrate`` writes. A function of your
+            own is called with a calibration, a folder, and a dictionary that says of what session it is. Where it has options,
+            it is a dataclass: its ``repr`` tells one choice of them from another.
         prepare: called first where a session is calibrated: it imports the modules that register losses, camera unknowns or
             file formats of your own, for example ``functools.partial(importlib.import_module, "my_losses")``.
         progress: called after each session.
@@ -122,7 +124,7 @@ def calibrate_many(
     jobs = _checked_jobs(jobs, executor)
     _check_shard(shard)
     folder = None if out is None else Path(out).absolute()
-    settings = Settings(load_config(config), refine, folder, write, memory_bytes if executor else None)
+    settings = Settings(load_config(config), refine, folder, write or ResultFiles(), memory_bytes if executor else None)
     sources, total = sources_of(sessions)
     if shard is not None:
         total = None if total is None else len(range(shard[0] - 1, total, shard[1]))

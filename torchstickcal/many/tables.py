@@ -10,13 +10,13 @@ from dataclasses import asdict, fields
 from pathlib import Path
 from urllib.parse import quote
 
-from torchstickcal.files import atomic_set, json_text
+from torchstickcal.files import PAGE_FILE, REPORT_FILE, atomic_set, json_text
 from torchstickcal.io.recording import natural_order
 from torchstickcal.many.manifest import CONVERGED, FAILED, MANIFESTS, NOT_CONVERGED, SessionRow, read_manifests
 
-CSV_FILE, LINES_FILE, PAGE_FILE = "sessions.csv", "sessions.jsonl", "index.html"
-FILES = (CSV_FILE, LINES_FILE, PAGE_FILE)
-_LINKED = ("report.html", "report.json")
+CSV_FILE, LINES_FILE, INDEX_FILE = "sessions.csv", "sessions.jsonl", "index.html"
+FILES = (CSV_FILE, LINES_FILE, INDEX_FILE)
+_LINKED = (PAGE_FILE, REPORT_FILE)
 """Files in the folder of a session to which the page links; the first that is there."""
 _STYLE = """
 body { font: 15px/1.5 system-ui, sans-serif; max-width: 90rem; margin: 2rem auto; padding: 0 1rem; color: #22272c; }
@@ -43,7 +43,7 @@ def write_tables(folder: Path) -> None:
         with atomic_set(folder) as new:
             (new / CSV_FILE).write_text(as_csv(rows), "utf-8", newline="")
             (new / LINES_FILE).write_text("".join(json_text(asdict(row), indent=None) + "\n" for row in rows), "utf-8")
-            (new / PAGE_FILE).write_text(page(rows, folder), "utf-8")
+            (new / INDEX_FILE).write_text(page(rows, folder), "utf-8")
         if _sizes(folder) == before:
             return
 

@@ -13,30 +13,19 @@ from pathlib import Path
 from typing import Any
 
 from torchstickcal.config import Config
-from torchstickcal.files import atomic_path, atomic_set, json_text, remove_remains
-from torchstickcal.io import write_calibration
+from torchstickcal.files import atomic_set, remove_remains
 from torchstickcal.many.manifest import CONVERGED, FAILED, NOT_CONVERGED, SessionRow
 from torchstickcal.many.memory import Budget, check_enough, needed_bytes
 from torchstickcal.many.sources import Source
 from torchstickcal.pipeline.calibrate import calibrate
 from torchstickcal.result import Calibration
-from torchstickcal.show.report import summary
 
-POINTS_FILE = "points.npz"
 RESULTS = "results"
 """The folder, in that of all results, with a folder for each session."""
 _LONGEST_FOLDER = 100
 
 Write = Callable[[Calibration, Path, dict[str, Any]], None]
 """Writes a calibration into a folder; the dictionary says of what session it is, as JSON can hold it."""
-
-
-def write_files(calibration: Calibration, folder: Path, provenance: dict[str, Any]) -> None:
-    """Write ``calibration.toml``, ``points.npz`` and ``report.json``."""
-    write_calibration(folder / "calibration.toml", calibration, "pose2sim")
-    calibration.save(folder / POINTS_FILE)
-    with atomic_path(folder / "report.json") as temporary:
-        temporary.write_text(json_text(provenance | summary(calibration)) + "\n", "utf-8")
 
 
 @dataclass(frozen=True)

@@ -51,6 +51,21 @@ class State:
         factor = factors[:, None, None]
         return replace(self, translations=self.translations * factor, points=self.points * factor)
 
+    def depth_reversed(self, known: Tensor) -> State:
+        """The scenes with depths reversed about their middle, and the poses from which they look almost the same.
+
+        The depths are those of the first camera, which is the world. In parallel projection the images would be the same.
+
+        Args:
+            known: (B, N), the points whose middle it is.
+        """
+        across = torch.tensor([1.0, 1.0, -1.0]).to(self.rotations)
+        middle = self.points.where(known[:, None], torch.nan).nanmedian(-1, keepdim=True).values.nan_to_num()
+        rotations = across[:, None] * self.rotations * across
+        translations = self.translations + ((self.rotations - rotations) @ middle[:, None])[..., 0]
+        points = middle + across[:, None] * (self.points - middle)
+        return replace(self, rotations=rotations, translations=translations, points=points)
+
     def retracted(self, camera_step: Tensor, point_step: Tensor, unknown_step: Tensor | None = None) -> State:
         """The state after a step.
 

@@ -39,6 +39,10 @@ from torchstickcal.solvers import StageRecord
 _INITIALISE, _RELABEL = "initialise", "relabel"
 _MAX_RELABELLINGS = 3
 _MOST_ROUNDS = 6
+_LARGE_ERRORS, _CLEARLY_LESS = 0.002, 0.9
+"""Root of the lower quartile of the squared residuals, as a fraction of the focal length, from which on a scene may be taken
+for its reverse; and ratio of two such quartiles that says so."""
+_MOST_SORTED = 100_003
 _SETTLED = 0.1
 """Relative change of the numbers of keypoints that count as one, below which a stage need not be repeated with new ones."""
 
@@ -429,7 +433,7 @@ def through(stages: Iterable[tuple[str, Stage]], adjustment: Adjustment, run: Ru
 
 def _relabelling(stages: Sequence[tuple[str, Stage]], begun: Adjustment, run: Run) -> Adjustment:
     """Sessions after their first stages, which are run again where label errors were found, until none are left."""
-    ended = through(stages, begun, run)
+    ended = _on_the_right_side(stages[:1], through(stages, begun, run), run)
     for _ in range(_MAX_RELABELLINGS if run.config.relabel else 0):
         before = [ended[session] for session in range(ended.seen.sessions)]
         after = [relabelled(session, run) for session in before]
@@ -440,6 +444,33 @@ def _relabelling(stages: Sequence[tuple[str, Stage]], begun: Adjustment, run: Ru
             break
         ended = through(stages, Adjustment.stack(after), run).replaced(~changed, ended)
     return ended
+
+
+def _on_the_right_side(stages: Sequence[tuple[str, Stage]], ended: Adjustment, run: Run) -> Adjustment:
+    """Sessions after some stages, or after the same from reversed depths where the views then clearly fit together better.
+
+    Images of a distant scene look almost alike if its depths are reversed (Necker's cube). With large errors the start may be
+    on the wrong side, and an adjustment does not leave it. Where the errors are small, no scene looks like its reverse.
+    """
+    squared = _small_squared_residuals(ended)
+    large = squared > (_LARGE_ERRORS * ended.measurements.cameras.focal_px.mean(1)).square()
+    if not bool(large.any()):
+        return ended
+    before = [ended[session] for session in range(ended.seen.sessions)]
+    reversed_ = [
+        replace(one, state=one.state.depth_reversed(one.measurements.active), results=(), records=((),)) for one in before
+    ]
+    others = through(stages, Adjustment.stack(reversed_), run)
+    better = large & (_small_squared_residuals(others) < _CLEARLY_LESS * squared)
+    return ended.replaced(better, others) if bool(better.any()) else ended
+
+
+def _small_squared_residuals(adjustment: Adjustment) -> Tensor:
+    """The lower quartile of each session's squared residuals, (B,), square pixels: few outliers are among them."""
+    m = adjustment.measurements
+    squared = m.squared_residuals(adjustment.state).double().where(m.visible, torch.nan).flatten(1)
+    step = -(-squared.shape[1] // _MOST_SORTED)
+    return squared[:, ::step].nanquantile(0.25, dim=1)
 
 
 def relabelled(adjustment: Adjustment, run: Run) -> Adjustment:

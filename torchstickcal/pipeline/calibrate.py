@@ -132,7 +132,7 @@ def _calibrated(
     # 2. Initialise rig and points, and 3. adjust them in stages, at the time offsets at which the views fit together best.
     adjusted, clocks = models.adjusted(clocks)
 
-    # 4. Check the given lenses and clocks; with refine="auto", estimate what the keypoints contradict.
+    # 4. Check the given lenses and clocks when that is first asked for; with refine="auto", estimate what is contradicted.
     check = CameraCheck(adjusted, config.camera_groups)
     if config.refine == "auto":
         adjusted, check = models.refined_where_contradicted(adjusted, check)
@@ -141,7 +141,9 @@ def _calibrated(
     ended = adjust_points(adjusted, run)
 
     # 6. Conclude: covariance, and the result in the caller's dtype. Its quality is judged when it is first asked for.
-    unsynchronised = config.synchronise and "time_offset" not in ended.refined and models.unsynchronised
+    def unsynchronised() -> bool:
+        return config.synchronise and "time_offset" not in ended.refined and models.unsynchronised
+
     run.took("total", time.perf_counter() - began)
     calibration = conclude(ended, check, clocks, unsynchronised, left_out, models.start_contradicted, run)
     if callback:

@@ -15,6 +15,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from torchstickcal.geometry.cameras import Intrinsics
 from torchstickcal.geometry.singular import covariance_of, solve_information
 from torchstickcal.lazy import cached_property
 from torchstickcal.model.correlation import ErrorCorrelation, error_correlation
@@ -70,8 +71,42 @@ class Solution(NamedTuple):
     """(K, K)"""
 
 
+class _System(NamedTuple):
+    """The reduced camera system of one session, with a column for every unknown of every camera."""
+
+    cameras: Intrinsics
+    every: RigUnknowns
+    state: State
+    objective: Objective
+    information: Tensor
+    gradient: Tensor
+    gradient_covariance: Tensor
+    """that of the gradient, the information itself where errors of the keypoints do not last"""
+
+    @staticmethod
+    def of(part: Adjustment, variants: tuple[str, ...], groups: Sequence[str]) -> _System:
+        """That of a session where it has ended, with some variant of every unknown."""
+        result, sigma_px = part.last, part.last.sigma_px
+        kept = part.exposures.at_common_times(part.seen, part.state, part.support).keeping(result.inliers)
+        cameras = kept.cameras_at(part.state).to(torch.float64)
+        every = RigUnknowns.of(variants, cameras, groups)
+        state = replace(part.state, unknowns=every.given)
+        objective = likelihood(_with_every_unknown(kept, part.state, every), part.last_camera_stage.losses, sigma_px)
+        system = NormalEquations(objective, state, cameras_free=True)
+        information = gradient_covariance = system.reduced[0]
+        correlation = _unexplained_correlation(objective, state, sigma_px)
+        if correlation.lasts:
+            gradient_covariance = information @ camera_covariance(objective, state, correlation)[0] @ information
+        return _System(cameras, every, state, objective, information, system.reduced_gradient[0], gradient_covariance)
+
+    @property
+    def poses(self) -> int:
+        """Number of the unknowns of the cameras' poses, which come first."""
+        return len(self.gradient) - self.every.count
+
+
 class CameraCheck:
-    """One session's cameras at a solution, examined as if their lenses and clocks were unknown.
+    """One session's cameras at a solution, examined as if their lenses and clocks were unknown, when first asked.
 
     Args:
         adjustment: one session where it has ended. Of a long one the middle is examined.
@@ -79,36 +114,20 @@ class CameraCheck:
     """
 
     def __init__(self, adjustment: Adjustment, groups: Sequence[str]) -> None:
-        part = adjustment.within(_CHECKED_FRAMES)
-        result, state = part.last, part.state
-        support = part.support
-        kept = part.exposures.at_common_times(part.seen, state, support).keeping(result.inliers)
-        cameras = kept.cameras_at(state).to(torch.float64)
-        self._cameras, self._groups = cameras, groups
+        self._adjustment, self._groups = adjustment, groups
         self._choices: dict[tuple[str, ...], tuple[Tensor, RigUnknowns]] = {}
         self._solutions: dict[tuple[str, ...], Solution] = {}
         self._variants = {unknown.name: next(iter(unknown.variants)) for unknown in all_unknowns().values()}
-        self._every = RigUnknowns.of(tuple(self._variants.values()), cameras, groups)
-        sigma_px = result.sigma_px
-        self._state = replace(state, unknowns=self._every.given)
-        losses = part.last_camera_stage.losses
-        self._objective = likelihood(_with_every_unknown(kept, state, self._every), losses, sigma_px)
-        system = NormalEquations(self._objective, self._state, cameras_free=True)
-        self._information, self._gradient = system.reduced[0], system.reduced_gradient[0]
-        self._gradient_covariance = self._information
-        correlation = _unexplained_correlation(self._objective, self._state, sigma_px)
-        if correlation.lasts:
-            covariance = camera_covariance(self._objective, self._state, correlation)[0]
-            self._gradient_covariance = self._information @ covariance @ self._information
 
-    def suggestions(self) -> dict[str, Suggestion]:
-        """What the keypoints suggest for each unknown by itself, by its name."""
-        found: dict[str, Suggestion] = {}
-        for name, variant in self._variants.items():
-            unknowns, values, covariance = self._solved((variant,))
-            deviation, variance = unknowns.by_name(values[None])[name][0], unknowns.variances(covariance)[name]
-            found[name] = Suggestion(deviation, variance.sqrt())
-        return found
+    @cached_property
+    def _system(self) -> _System:
+        return _System.of(self._adjustment.within(_CHECKED_FRAMES), tuple(self._variants.values()), self._groups)
+
+    def suggestion(self, name: str) -> Suggestion:
+        """What the keypoints suggest for an unknown by itself, by its name."""
+        unknowns, values, covariance = self._solved((self._variants[name],))
+        deviation, variance = unknowns.by_name(values[None])[name][0], unknowns.variances(covariance)[name]
+        return Suggestion(deviation, variance.sqrt())
 
     def wanted(
         self, allowed: Collection[str], refined: Sequence[str] = (), failed: Sequence[tuple[str, ...]] = ()
@@ -220,7 +239,7 @@ class CameraCheck:
             values: (K,), at which the cameras are.
         """
         chosen, _ = self._chosen(names)
-        poses = len(self._gradient) - self._every.count
+        poses = self._system.poses
         information, gradient = self._without(fold, chosen)
         moved = gradient[:poses] - information[:poses, poses:] @ values
         given = torch.cat([-solve_information(information[:poses, :poses], moved), -values])
@@ -233,33 +252,33 @@ class CameraCheck:
 
     def _without(self, fold: Fold, chosen: Tensor) -> tuple[Tensor, Tensor]:
         """The system of poses and a choice's unknowns of all keypoints but a fold's."""
-        information, gradient = self._information - fold.information, self._gradient - fold.gradient
+        information, gradient = self._system.information - fold.information, self._system.gradient - fold.gradient
         return chosen.mT @ information @ chosen, chosen.mT @ gradient
 
     @cached_property
     def _folds(self) -> tuple[list[Fold], list[Fold]]:
         """Parts of the keypoints: frames one after another, and groups of points."""
-        m = self._objective.measurements
+        objective, state = self._system.objective, self._system.state
+        m = objective.measurements
         blocks = [frames for frames in _blocks(m.frames, _FRAME_FOLDS) if frames.stop > frames.start]
         columns = [m.columns_of(frames) for frames in blocks]
         of_frames = [
-            _fold(m.within(f), self._objective, replace(self._state, points=self._state.points[..., c]))
+            _fold(m.within(f), objective, replace(state, points=state.points[..., c]))
             for f, c in zip(blocks, columns, strict=True)
         ]
-        of_points = [_fold(m.keeping(kept), self._objective, self._state) for kept in _point_groups(self._objective)]
+        of_points = [_fold(m.keeping(kept), objective, state) for kept in _point_groups(objective)]
         return of_frames if len(of_frames) > 1 else [], of_points if len(of_points) > 1 else []
 
     def _solved(self, names: tuple[str, ...]) -> Solution:
         """A choice's unknowns, their values and their covariance."""
         if names in self._solutions:
             return self._solutions[names]
-        chosen, unknowns = self._chosen(names)
-        poses = len(self._gradient) - self._every.count
-        information = chosen.mT @ self._information @ chosen
-        values = -solve_information(information, chosen.mT @ self._gradient)[poses:]
+        system, (chosen, unknowns) = self._system, self._chosen(names)
+        poses, information = system.poses, chosen.mT @ system.information @ chosen
+        values = -solve_information(information, chosen.mT @ system.gradient)[poses:]
         covariance = covariance_of(information)
-        if self._gradient_covariance is not self._information:
-            covariance = covariance @ chosen.mT @ self._gradient_covariance @ chosen @ covariance
+        if system.gradient_covariance is not system.information:
+            covariance = covariance @ chosen.mT @ system.gradient_covariance @ chosen @ covariance
         self._solutions[names] = Solution(unknowns, values, covariance[poses:, poses:])
         return self._solutions[names]
 
@@ -267,13 +286,14 @@ class CameraCheck:
         """The map from poses and a choice's unknowns to poses and all unknowns, and the choice's unknowns."""
         if names in self._choices:
             return self._choices[names]
-        unknowns = RigUnknowns.of(names, self._cameras, self._groups)
-        poses = torch.eye(len(self._gradient) - self._every.count).to(self._gradient)
-        every = [(unknown.name, component) for unknown in self._every.unknowns for component in unknown.components]
+        system = self._system
+        unknowns = RigUnknowns.of(names, system.cameras, self._groups)
+        poses = torch.eye(system.poses).to(system.gradient)
+        every = [(unknown.name, component) for unknown in system.every.unknowns for component in unknown.components]
         chosen = [(unknown.name, component) for unknown in unknowns.unknowns for component in unknown.components]
         picked = unknowns.share.new_zeros(len(unknowns.share), len(every), unknowns.count)
         picked[:, [every.index(component) for component in chosen]] = unknowns.share
-        means = self._every.share / self._every.share.sum((0, 1))
+        means = system.every.share / system.every.share.sum((0, 1))
         self._choices[names] = torch.block_diag(poses, torch.einsum("cki,ckj->ij", means, picked)), unknowns
         return self._choices[names]
 

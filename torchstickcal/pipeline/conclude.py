@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import partial
 
 import torch
 from torch import Tensor
 
 from torchstickcal.model.correlation import error_correlation
-from torchstickcal.model.unknowns import RigEstimate, all_unknowns
+from torchstickcal.model.unknowns import CameraUnknown, RigEstimate, all_unknowns
 from torchstickcal.pipeline.adjust import Adjustment
 from torchstickcal.pipeline.check import CameraCheck
 from torchstickcal.pipeline.run import Run
@@ -17,13 +18,14 @@ from torchstickcal.quality.evidence import Evidence
 from torchstickcal.quality.judge import judged
 from torchstickcal.result import Calibration, CameraParameter
 from torchstickcal.solvers.uncertainty import camera_covariance, likelihood, ruler_covariance
+from torchstickcal.workers import on_worker
 
 
 def conclude(
     ended: Adjustment,
     check: CameraCheck,
     clocks: ClockEstimate | None,
-    unsynchronised: bool,
+    unsynchronised: Callable[[], bool],
     left_out: tuple[str, ...],
     start_contradicted: bool,
     run: Run,
@@ -34,7 +36,7 @@ def conclude(
         ended: where its last stage ended.
         check: what the keypoints say of lenses and clocks.
         clocks: what a search for time offsets has found; None without one.
-        unsynchronised: whether the motion contradicts the clocks, which were not estimated.
+        unsynchronised: says whether the motion contradicts the clocks, which were not estimated.
         left_out: names of the cameras that are no part of the rig.
         start_contradicted: whether poses were given as a start that the keypoints contradict.
         run: its configuration, and the time by step.
@@ -125,7 +127,7 @@ def _unknowns(ended: Adjustment, check: CameraCheck, covariance: Tensor) -> dict
     """Everything that can be unknown of the cameras beside their poses, refined or not, in its own unit."""
     observations, frames, measurements = ended.observations[0], ended.frames[0], ended.measurements
     found = {name: own[0] for name, own in measurements.unknowns.by_name(ended.state.unknowns).items()}
-    variances, suggestions = measurements.unknowns.variances(covariance), check.suggestions()
+    variances = measurements.unknowns.variances(covariance)
     zero = measurements.cameras.focal_px[0].new_zeros(measurements.num_cameras)
     estimate = RigEstimate(
         given=measurements.cameras[0],
@@ -138,9 +140,6 @@ def _unknowns(ended: Adjustment, check: CameraCheck, covariance: Tensor) -> dict
     parameters: dict[str, CameraParameter] = {}
     for name, unknown in all_unknowns().items():
         value, given, factor = unknown.in_units(estimate)
-        deviation, std = suggestions[name]
-        deviations = estimate.deviations | {name: estimate.deviations[name] + deviation}
-        moved = estimate._replace(found=unknown.applied(estimate.found, deviation), deviations=deviations)
         parameters[name] = CameraParameter(
             label=unknown.label,
             unit=unknown.unit,
@@ -150,10 +149,18 @@ def _unknowns(ended: Adjustment, check: CameraCheck, covariance: Tensor) -> dict
             std=_own(variances[name].sqrt() * factor.abs() if name in found else torch.full_like(value, torch.nan)),
             given=_own(given),
             prior_std=_own(unknown.prior(estimate.given) * factor.abs()),
-            suggested=_own(unknown.in_units(moved).value),
-            suggested_std=_own(std * factor.abs()),
+            suggestion=partial(_suggestion, check, unknown, estimate),
         )
     return parameters
+
+
+def _suggestion(check: CameraCheck, unknown: CameraUnknown, estimate: RigEstimate) -> tuple[Tensor, Tensor]:
+    """What the keypoints suggest for something that may be unknown of the cameras, and its standard deviation, in its unit."""
+    deviation, std = on_worker(estimate.found.matrix.device, check.suggestion, unknown.name)
+    deviations = estimate.deviations | {unknown.name: estimate.deviations[unknown.name] + deviation}
+    moved = estimate._replace(found=unknown.applied(estimate.found, deviation), deviations=deviations)
+    _, _, factor = unknown.in_units(estimate)
+    return _own(unknown.in_units(moved).value), _own(std * factor.abs())
 
 
 def _own(values: Tensor) -> Tensor:

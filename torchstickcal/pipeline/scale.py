@@ -14,6 +14,11 @@ from torchstickcal.model.measurements import Measurements
 
 _OUTLIER_CUT = 3.5
 _MAD_TO_SIGMA = 1.4826
+_ALIKE = 0.03
+"""Difference of the logarithms of two lengths that agree."""
+_MAJORITY, _LEAST_SHARE, _LEAST_FRAMES = 2.0, 0.2, 5
+"""Lengths that agree with each other, over those that agree with the known one, from which on they are believed instead; least
+share of all lengths, and least number."""
 
 
 @dataclass(frozen=True)
@@ -98,3 +103,28 @@ def scale_factors(measurements: Measurements, points: Tensor, known: Sequence[Ru
         expected += ruler.lengths_m * lengths.isfinite().sum(1)
     reconstructed = (measured > 0) & measured.isfinite()
     return expected.where(reconstructed, 1.0) / measured.where(reconstructed, 1.0), reconstructed
+
+
+def outvoted_factors(measurements: Measurements, points: Tensor, known: Sequence[Ruler]) -> Tensor:
+    """Known over reconstructed length, (B,), where clearly more lengths agree on another scale than on the present one; else 1.
+
+    Where ends are often wrong, a robust loss of the length may have settled where a few wrong lengths are right by chance.
+
+    Args:
+        measurements: the sessions.
+        points: (B, 3, N), to scale.
+        known: the rulers.
+    """
+    ratios = [r.measured_m(measurements, points) / r.lengths_m[:, None] for r in known if r.rigid]
+    if not ratios:
+        return points.new_ones(measurements.sessions)
+    logs = torch.cat(ratios, dim=1).log().nan_to_num(torch.inf, torch.inf, torch.inf).sort(1).values
+    finite = logs.isfinite()
+    first, last = (torch.searchsorted(logs, (logs + shift).contiguous()) for shift in (-_ALIKE, _ALIKE))
+    votes, winner = (last - first).where(finite, 0).max(1, keepdim=True)
+    alike = finite & ((logs - logs.gather(1, winner)).abs() <= _ALIKE)
+    agreeing = (finite & (logs.abs() <= _ALIKE)).sum(1)
+    least = (_LEAST_SHARE * finite.sum(1)).clamp_min(_LEAST_FRAMES)
+    clear = (votes[:, 0] > _MAJORITY * agreeing) & (votes[:, 0] >= least)
+    mean = logs.where(alike, 0.0).sum(1) / alike.sum(1).clamp_min(1)
+    return (-mean).exp().where(clear, 1.0)

@@ -17,7 +17,7 @@ from torchstickcal.model.objective import Objective
 from torchstickcal.model.state import State
 from torchstickcal.pipeline.noise import Chosen, NoiseGates, NoiseLevels
 from torchstickcal.pipeline.run import Run
-from torchstickcal.pipeline.scale import rulers, scale_factors
+from torchstickcal.pipeline.scale import outvoted_factors, rulers, scale_factors
 from torchstickcal.solvers import StageRecord, Stop, Termination, solver
 
 _RESOLUTION = {torch.float64: 0.0, torch.float32: 1e-6}
@@ -89,6 +89,8 @@ def run_stage(
         roughly: whether it is enough to come near the minimum.
     """
     began, given = time.perf_counter(), measurements
+    if stage.cameras == "free" and not stage.rescale:
+        state = state.scaled(outvoted_factors(measurements, state.points, rulers(measurements, run.config)))
     squared_residuals = measurements.squared_residuals(state)
     near = Chosen(near_keypoints(measurements, squared_residuals), NEAR_SIGMAS)
     sigma_px = near.sigma_px(measurements, squared_residuals)

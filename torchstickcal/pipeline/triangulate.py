@@ -259,7 +259,7 @@ def _concluded(ended: Adjustment, clocks: _Clocks | None, covariance: Tensor, ru
         measurements.cameras_at(ended.state).to(torch.float64)[0],
         covariance,
     )
-    evidence = Evidence(ended, {}, covariance, torch.zeros_like(covariance), None, False, (), run.config)
+    evidence = Evidence(ended, {}, covariance, torch.zeros_like(covariance), None, lambda: False, (), run.config)
     ends = torch.tensor([stick.ends for stick in observations.sticks], dtype=torch.long).view(-1, 2)
     offsets = frames.offsets_frames + (0.0 if clocks is None else clocks.offsets_frames)
     std = torch.full_like(offsets, torch.nan) if clocks is None else clocks.std_frames

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import torch
@@ -44,7 +44,7 @@ class Evidence:
         noise: covariance of the cameras' tangents and unknowns by the errors of the keypoints.
         ruler: the covariance that the errors of the sticks' given lengths add.
         clocks: what a search for time offsets has found; None without one.
-        unsynchronised: whether the motion contradicts the clocks, which were not estimated.
+        unsynchronised: says whether the motion contradicts the clocks, which were not estimated.
         left_out: names of the cameras that are no part of the rig.
         config: the configuration.
         start_contradicted: whether poses were given as a start that the keypoints contradict.
@@ -55,7 +55,7 @@ class Evidence:
     noise: Tensor
     ruler: Tensor
     clocks: ClockEstimate | None
-    unsynchronised: bool
+    unsynchronised: Callable[[], bool]
     left_out: tuple[str, ...]
     config: Config
     start_contradicted: bool = False

@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import math
+import re
+import shutil
+import textwrap
 from typing import NamedTuple
 
 from torchstickcal.quality.verdict import Verdict
@@ -41,6 +44,9 @@ CAMERA_COLOURS = (
     Colour("#0f8a9c", "#4fc8d8"), Colour("#1f3c78", "#8ea6de"),
 )  # fmt: skip
 """Of the cameras, in their order; the eleventh has that of the first again."""
+_NARROWEST_TEXT, _WIDEST_TEXT = 40, 118
+_BEFORE_UNIT = re.compile(r"(?<=\d) (?=%|(mm|cm|m|px|mrad|deg|ms|s|Hz)\b)")
+"""A blank at which no line is broken."""
 TERMINAL_COLOURS = {Verdict.GOOD: "32", Verdict.USABLE: "33", Verdict.POOR: "31", Verdict.FAILED: "1;31"}
 """Parameters of a terminal's sequence SGR: green, yellow, red, bold red."""
 
@@ -48,6 +54,30 @@ TERMINAL_COLOURS = {Verdict.GOOD: "32", Verdict.USABLE: "33", Verdict.POOR: "31"
 def camera_colour(number: int) -> Colour:
     """The colour of a camera by its number."""
     return CAMERA_COLOURS[number % len(CAMERA_COLOURS)]
+
+
+def terminal_width() -> int:
+    """Columns that a text for people may have: those of the terminal, within limits; the widest where there is no terminal."""
+    return max(_NARROWEST_TEXT, min(_WIDEST_TEXT, shutil.get_terminal_size((_WIDEST_TEXT, 24)).columns))
+
+
+def wrapped(text: str, first: str = "", others: str = "  ") -> list[str]:
+    """A sentence as lines that fit into the terminal, not broken between a number and its unit.
+
+    Args:
+        text: the sentence.
+        first: what the first line begins with.
+        others: what the other lines begin with.
+
+    Example:
+        >>> wrapped("The floor is known to ± 11 mm.")
+        ['The floor is known to ± 11 mm.']
+    """
+    whole = _BEFORE_UNIT.sub("\N{NO-BREAK SPACE}", text)
+    lines = textwrap.wrap(
+        whole, terminal_width(), initial_indent=first, subsequent_indent=others, break_long_words=False, break_on_hyphens=False
+    )
+    return [line.replace("\N{NO-BREAK SPACE}", " ") for line in lines]
 
 
 def digits(value: float, significant: int = 3) -> str:

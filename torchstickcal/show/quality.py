@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import textwrap
-
 from torchstickcal.quality.finding import Finding, Severity
 from torchstickcal.quality.verdict import Acceptance, Quality, Verdict
-from torchstickcal.show.look import TERMINAL_COLOURS
+from torchstickcal.show.look import TERMINAL_COLOURS, share, wrapped
 
 _MEANINGS = {
     Verdict.GOOD: "nothing speaks against the result",
@@ -14,7 +12,6 @@ _MEANINGS = {
     Verdict.POOR: "the result is probably wrong, or much less precise than it could be",
     Verdict.FAILED: "the result, or a part of it, must not be used",
 }
-_WIDTH = 118
 
 
 def colour_of(verdict: Verdict) -> str:
@@ -42,7 +39,7 @@ def reasons_text(quality: Quality, notes: bool = False) -> str:
 
 def _shown(finding: Finding) -> list[str]:
     text = f"{finding.severity.name.lower()}: {finding.text} [{finding.code}]"
-    return textwrap.wrap(text, _WIDTH, initial_indent="  ", subsequent_indent="    ", break_long_words=False)
+    return wrapped(text, "  ", "    ")
 
 
 def _accepted(acceptance: Acceptance) -> list[str]:
@@ -50,9 +47,9 @@ def _accepted(acceptance: Acceptance) -> list[str]:
     for one in acceptance.lengths:
         x, y, z = one.volume_m
         lines.append(
-            f"{one.stick}, in {one.frames} frames that took no part{_wrong(one.wrong)}: errors largest "
-            f"{1000 * one.largest_m:+.2f} mm, mean {1000 * one.mean_m:+.2f} mm, standard deviation "
-            f"{1000 * one.std_m:.2f} mm, {one.inside:.0%} inside their 95 % intervals, in {x:.2g} x {y:.2g} x {z:.2g} m"
+            f"{one.stick}, in {one.frames} frames that took no part{_wrong(one.wrong)}: largest error "
+            f"{1000 * one.largest_m:+.2f} mm, mean error {1000 * one.mean_m:+.2f} mm, standard deviation "
+            f"{1000 * one.std_m:.2f} mm; {share(one.inside)} inside their 95 % intervals; volume {x:.2g} x {y:.2g} x {z:.2g} m"
         )
     lines.append(
         f"reprojection {acceptance.reprojection_px:.2f} px ({acceptance.reprojection_mrad:.2f} mrad), rays "
@@ -61,7 +58,7 @@ def _accepted(acceptance: Acceptance) -> list[str]:
     known = [px for px in acceptance.left_out_px if px == px]
     if known:
         lines.append(f"each camera predicted by the others: {', '.join(f'{px:.2f}' for px in acceptance.left_out_px)} px")
-    return [part for line in lines for part in textwrap.wrap(line, _WIDTH, subsequent_indent="  ", break_long_words=False)]
+    return [part for line in lines for part in wrapped(line)]
 
 
 def _wrong(count: int) -> str:

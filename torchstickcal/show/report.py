@@ -8,6 +8,7 @@ from typing import Any
 from torchstickcal.files import without_nan
 from torchstickcal.quality.finding import Severity
 from torchstickcal.result import Calibration, CameraParameter
+from torchstickcal.show.look import wrapped
 from torchstickcal.show.tables import (
     camera_facts,
     camera_table,
@@ -31,10 +32,10 @@ def table(calibration: Calibration, verbose: bool = True) -> str:
         tables += [stick for stick in (stick_table(calibration),) if stick is not None]
         tables += [point_table(calibration), stage_table(calibration)]
     text = [f"{one.title}\n{one.text()}" if number else one.text() for number, one in enumerate(tables)]
-    text.insert(1, frame_sentence(calibration))
+    text.insert(1, "\n".join(wrapped(frame_sentence(calibration))))
     if verbose:
         notes = [finding for finding in calibration.quality.findings if finding.severity == Severity.NOTE]
-        text += ["\n".join(f"note: {finding.text}" for finding in notes)] if notes else []
+        text += ["\n".join(line for finding in notes for line in wrapped(f"note: {finding.text}"))] if notes else []
     return "\n\n".join(text)
 
 

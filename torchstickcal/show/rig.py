@@ -8,6 +8,7 @@ from typing import cast
 
 import numpy as np
 from matplotlib.figure import Figure
+from matplotlib.patheffects import withStroke
 from mpl_toolkits.mplot3d import Axes3D
 from mpl_toolkits.mplot3d.art3d import Line3DCollection
 from numpy.typing import NDArray
@@ -21,6 +22,8 @@ from torchstickcal.show.tables import printable
 _MAX_STICK_FRAMES = 60
 _VIEW_DEG = 22.0, -62.0
 """Elevation and azimuth from which the scene is seen."""
+_HALO = [withStroke(linewidth=2.5, foreground="white")]
+"""Around names, so that they can be read in front of lines."""
 _STICK, _BODY = COLOURS["stick"].light, COLOURS["body"].light
 
 
@@ -70,7 +73,9 @@ def _draw_cameras(axes: Axes3D, names: Sequence[str], corners: NDArray[np.float6
         edges = [*((apex, corner) for corner in base), *itertools.pairwise([*base, base[0]])]
         colour = camera_colour(number).light
         axes.add_collection3d(Line3DCollection(np.array(edges), colors=colour, linewidths=1.2))
-        axes.text(apex[0], apex[1], apex[2], f" {printable(name)}", color=colour, fontsize=8, parse_math=False)
+        axes.text(
+            apex[0], apex[1], apex[2], f" {printable(name)}", color=colour, fontsize=8, parse_math=False, path_effects=_HALO
+        )
 
 
 def _draw_sticks(axes: Axes3D, calibration: Calibration, points: NDArray[np.float64], frame: int) -> None:

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import textwrap
 from collections.abc import Sequence
 from dataclasses import dataclass
 from html import escape
+from itertools import zip_longest
 from typing import NamedTuple
 
 from torch import Tensor
@@ -41,10 +43,12 @@ class Table:
     rows: tuple[tuple[str, ...], ...]
 
     def text(self) -> str:
-        """The table as lines for a terminal, columns aligned."""
-        heads = [column.heads for column in self.columns]
-        lines = [[head for head, _ in heads], *([[unit for _, unit in heads]] if any(unit for _, unit in heads) else [])]
+        """The table as lines for a terminal, columns aligned. Heads are broken where they are wider than their column."""
         rows = [[printable(cell) for cell in row] for row in self.rows]
+        heads = [_head_lines(column, [row[number] for row in rows]) for number, column in enumerate(self.columns)]
+        lines = list(map(list, zip_longest(*heads, fillvalue="")))
+        units = [column.heads[1] for column in self.columns]
+        lines += [units] if any(units) else []
         widths = [max(len(line[number]) for line in [*lines, *rows]) for number in range(len(self.columns))]
 
         def aligned(cells: Sequence[str]) -> str:
@@ -68,6 +72,13 @@ class Table:
             f'<h3>{escape(self.title)}</h3><div class="wide"><table>'
             f"<thead><tr>{heads}</tr></thead><tbody>{rows}</tbody></table></div>"
         )
+
+
+def _head_lines(column: Column, cells: Sequence[str]) -> list[str]:
+    """The head of a column, as wide as its cells or its longest word."""
+    head, unit = column.heads
+    width = max(map(len, (*cells, *head.split(), unit, " ")))
+    return textwrap.wrap(head, width, break_long_words=False, break_on_hyphens=False)
 
 
 def text_table(rows: Sequence[Sequence[str]]) -> str:
@@ -157,21 +168,28 @@ def camera_table(cameras: Sequence[CameraFacts]) -> Table:
         Column("rotation std", "deg", "standard deviation of the camera's rotation, relative to the first camera"),
         Column("reprojection", "px, median", "distance between a keypoint and the projection of its point"),
         Column("keypoints used", "", "keypoints that agree with the other cameras"),
-        Column("of those seen", "", "the rest contradicts the other cameras and was set aside"),
+        Column("share used", "", "share of the keypoints seen; the rest contradicts the other cameras and was set aside"),
     )
     rows = tuple(
         (
             camera.name,
-            " ".join(f"{value:8.4f}" for value in camera.centre_m),
+            position,
             f"{1000 * camera.std_m:.2f}",
             f"{camera.std_deg:.4f}",
             f"{camera.median_px:.3f}",
             str(camera.used),
             share(camera.used / camera.seen) if camera.seen else "-",
         )
-        for camera in cameras
+        for camera, position in zip(cameras, _aligned([camera.centre_m for camera in cameras]), strict=True)
     )
     return Table("Cameras", columns, rows)
+
+
+def _aligned(positions: Sequence[Sequence[float]]) -> list[str]:
+    """Positions as texts of equal width, metres."""
+    texts = [[f"{value:.3f}" for value in position] for position in positions]
+    width = max(len(text) for position in texts for text in position)
+    return [" ".join(text.rjust(width) for text in position) for position in texts]
 
 
 def unknown_tables(calibration: Calibration, only_refined: bool = False) -> list[Table]:
@@ -247,7 +265,7 @@ def point_table(calibration: Calibration) -> Table:
         Column("point", is_text=True),
         Column("noise", "px", "standard deviation of the point's keypoints along an axis"),
         Column("keypoints used", "", "keypoints that agree with the other cameras"),
-        Column("of those seen", "", "the rest contradicts the other cameras and was set aside"),
+        Column("share used", "", "share of the keypoints seen; the rest contradicts the other cameras and was set aside"),
         Column("relabelled", "", "keypoints that were given for another point: a label error that was undone"),
     )
     used, seen = calibration.inliers.sum((0, 1)).tolist(), keypoints_seen(calibration).sum((0, 1)).tolist()
@@ -255,7 +273,7 @@ def point_table(calibration: Calibration) -> Table:
     rows = tuple(
         (
             point_name(calibration, index),
-            digits(sigma),
+            digits(sigma) if seen[index] else "-",
             str(used[index]),
             share(used[index] / seen[index]) if seen[index] else "-",
             str(relabelled[index]),

@@ -161,7 +161,7 @@ class TensorBoardMonitor:
         reprojections = _reprojections(result, fisheye)
         for camera, label in enumerate(names):
             sizes = (reprojections - seen)[:, camera].norm(dim=-1)[result.inliers[:, camera] & result.converged[:, None, None]]
-            _write_histogram(writer, f"{name} residuals (px)/{_tag(label)}", sizes, step)
+            _write_histogram(writer, f"{name} residuals [px]/{_tag(label)}", sizes, step)
         if self._figures:
             session = int(result.converged.int().argmax())
             frame = int(result.inliers[session].sum((0, 2)).argmax())
@@ -225,12 +225,12 @@ class _CalibrationLog:
         scalars = {
             "solver/cost": record.cost,
             "solver/damping": record.damping,
-            "solver/step (m)": record.step_m,
+            "solver/step [m]": record.step_m,
             "solver/stage": len(self._stages),
-            "stick/mean length (m)": record.stick_length_m,
+            "stick/mean length [m]": record.stick_length_m,
         }
         scalars |= {f"loss/{name}": value for name, value in record.terms.items()}
-        scalars |= {f"reprojection (px)/{name}": v for name, v in zip(self._names, record.reprojection_px, strict=True)}
+        scalars |= {f"reprojection [px]/{name}": v for name, v in zip(self._names, record.reprojection_px, strict=True)}
         if record.rotations is not None and record.translations is not None:
             scalars |= self._poses(record.rotations, record.translations)
         _write_scalars(self._writer, scalars, self._step)
@@ -242,12 +242,12 @@ class _CalibrationLog:
         stds = zip(self._names, calibration.camera_std_m.tolist(), calibration.camera_std_deg.tolist(), strict=True)
         scalars = {}
         for name, std_m, std_deg in stds:
-            scalars |= {f"standard deviation (m)/{name}": std_m, f"standard deviation (deg)/{name}": std_deg}
+            scalars |= {f"standard deviation [m]/{name}": std_m, f"standard deviation [deg]/{name}": std_deg}
         _write_scalars(writer, scalars, last)
         sizes = calibration.residuals_px.norm(dim=-1)
         for name, used, found in zip(self._names, calibration.inliers, sizes, strict=True):
-            _write_histogram(writer, f"residuals (px)/{name}", found[used], last)
-        _write_histogram(writer, "stick/length in each frame (m)", calibration.stick_lengths_m, last)
+            _write_histogram(writer, f"residuals [px]/{name}", found[used], last)
+        _write_histogram(writer, "stick/length in each frame [m]", calibration.stick_lengths_m, last)
         quality = calibration.quality
         sentence = f"\n{quality.acceptance.sentence}" if quality.acceptance is not None else ""
         verdict = f"verdict: {quality.verdict} ({meaning_of(quality.verdict)}){sentence}"
@@ -271,8 +271,8 @@ class _CalibrationLog:
         scalars: dict[str, float] = {}
         for name, centre, turn in list(zip(self._names, centres, self._turns, strict=True))[1:]:
             for axis, position, angle in zip("xyz", centre, np.degrees(turn).tolist(), strict=True):
-                scalars[f"camera positions (m)/{name} {axis}"] = position
-                scalars[f"camera rotations (deg)/{name} {axis}"] = angle
+                scalars[f"camera positions [m]/{name} {axis}"] = position
+                scalars[f"camera rotations [deg]/{name} {axis}"] = angle
         return scalars
 
     def _charts(self) -> dict[str, dict[str, list[Any]]]:
@@ -280,11 +280,11 @@ class _CalibrationLog:
         poses = {
             f"{name}: {what}": ["Multiline", [re.escape(f"{group}/{name}") + " [xyz]$"]]
             for name in self._names[1:]
-            for what, group in (("position (m)", "camera positions (m)"), ("rotation (deg)", "camera rotations (deg)"))
+            for what, group in (("position (m)", "camera positions [m]"), ("rotation (deg)", "camera rotations [deg]"))
         }
         everything = {
             "losses": ["Multiline", ["^loss/"]],
-            "reprojection error of each camera (px)": ["Multiline", [r"^reprojection \(px\)/"]],
+            "reprojection error of each camera (px)": ["Multiline", [r"^reprojection \[px\]/"]],
             "mean length of the stick (m)": ["Multiline", [r"^stick/mean length"]],
         }
         return {"Calibration": everything, "Cameras": poses}
@@ -304,16 +304,16 @@ class _CalibrationLog:
         final = {
             "final/converged": float(calibration.converged),
             "final/warnings": float(len(calibration.warnings)),
-            "final/reprojection, median (px)": float(calibration.reprojection_median_px.nanmedian()),
-            "final/noise of the keypoints (px)": float(calibration.sigma_px.median()),
+            "final/reprojection, median [px]": float(calibration.reprojection_median_px.nanmedian()),
+            "final/noise of the keypoints [px]": float(calibration.sigma_px.median()),
             "final/share of inliers": float(calibration.inliers.sum() / calibration.residuals_px.isfinite().all(-1).sum()),
-            "final/largest standard deviation (m)": float(calibration.camera_std_m.max()),
-            "final/largest standard deviation (deg)": float(calibration.camera_std_deg.max()),
+            "final/largest standard deviation [m]": float(calibration.camera_std_m.max()),
+            "final/largest standard deviation [deg]": float(calibration.camera_std_deg.max()),
             "final/standard deviation of the scale": float(calibration.scale_std),
-            "final/spread of the stick's length (m)": float(lengths[lengths.isfinite()].std(correction=0))
+            "final/spread of the stick's length [m]": float(lengths[lengths.isfinite()].std(correction=0))
             if lengths.numel()
             else 0.0,
-            "final/time (s)": calibration.seconds["total"],
+            "final/time [s]": calibration.seconds["total"],
         }
         file = self._writer.file_writer
         assert file is not None
@@ -365,7 +365,7 @@ def _shares(result: LayerResult, seen: Tensor | None) -> dict[str, float]:
     good = result.converged
     if bool(good.any()):
         noise = result.sigma_px[good]
-        scalars["/noise of the keypoints (px)"] = float(noise[noise > 0].median()) if bool((noise > 0).any()) else 0.0
+        scalars["/noise of the keypoints [px]"] = float(noise[noise > 0].median()) if bool((noise > 0).any()) else 0.0
         if seen is not None:
             given = seen[good].isfinite().all(-1)
             scalars["/share of inliers"] = float(result.inliers[good].sum() / given.sum().clamp(min=1))
@@ -383,10 +383,10 @@ def _camera_errors(result: LayerResult, truth: Any, names: Sequence[str]) -> dic
         rotations, translations = rotations[good], translations[good]
     errors = pose_errors(result.rotations[good], result.translations[good], rotations, translations)
     position, angle = errors.translation_m, errors.rotation_deg
-    scalars = {"/position error (m)": float(position.mean()), "/rotation error (deg)": float(angle.mean())}
+    scalars = {"/position error [m]": float(position.mean()), "/rotation error [deg]": float(angle.mean())}
     for camera, name in enumerate(names):
-        scalars[f" position error (m)/{_tag(name)}"] = float(position[:, camera].mean())
-        scalars[f" rotation error (deg)/{_tag(name)}"] = float(angle[:, camera].mean())
+        scalars[f" position error [m]/{_tag(name)}"] = float(position[:, camera].mean())
+        scalars[f" rotation error [deg]/{_tag(name)}"] = float(angle[:, camera].mean())
     return scalars
 
 
@@ -436,8 +436,11 @@ def _nearest_turn(turn: NDArray[np.float64], previous: NDArray[np.float64]) -> N
 
 
 def _tag(name: str) -> str:
-    """A camera's name in a tag, where a slash would begin another level."""
-    return printable(name).replace("/", "_")
+    """A camera's name in a tag, where a slash would begin another level.
+
+    TensorBoard draws no curve in the tab Custom Scalars for a tag with round brackets; therefore units are in square ones.
+    """
+    return printable(name).translate(str.maketrans("/()", "_[]"))
 
 
 def _code(text: str) -> str:

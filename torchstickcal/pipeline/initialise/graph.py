@@ -131,8 +131,12 @@ def _place_again(rotations: Array, translations: Array, rays: Array, visible: ND
     """Place cameras anew, in place, by the points of all others, the least supported first (perspective-n-point, RANSAC)."""
     cameras = range(len(rays))
     for _ in range(_PLACING_ROUNDS if len(rays) > 2 else 0):
-        supports = [_supported(c, rotations, translations, rays, visible, scale) for c in cameras]
-        doubtful = [c for c in sorted(cameras, key=lambda c: supports[c].share) if supports[c].share < _SOUND_SHARE]
+        shares: dict[int, float] = {}
+        for camera in cameras:  # points that most views agree on take longer, and are needed only where plain ones do not do
+            plain = _supported(camera, rotations, translations, rays, visible, scale, triangulate).share
+            if plain < _SOUND_SHARE:
+                shares[camera] = _supported(camera, rotations, translations, rays, visible, scale).share
+        doubtful = [camera for camera in sorted(shares, key=lambda c: shares[c]) if shares[camera] < _SOUND_SHARE]
         if not doubtful:
             return
         for camera in doubtful:
@@ -176,11 +180,17 @@ class _Support(NamedTuple):
 
 
 def _supported(
-    camera: int, rotations: Array, translations: Array, rays: Array, visible: NDArray[np.bool_], scale: float
+    camera: int,
+    rotations: Array,
+    translations: Array,
+    rays: Array,
+    visible: NDArray[np.bool_],
+    scale: float,
+    method: Callable[..., torch.Tensor] = triangulate_robustly,
 ) -> _Support:
-    """The support of a camera by the points of all others."""
+    """The support of a camera by the points of all others, triangulated by a method."""
     others = [other for other in range(len(rays)) if other != camera]
-    known = _points(triangulate_robustly, others, rotations, translations, rays, visible, scale)
+    known = _points(method, others, rotations, translations, rays, visible, scale)
     seen = np.flatnonzero(visible[camera] & np.isfinite(known).all(0))
     weights = _kernel_weights(rotations[camera], translations[camera], known[:, seen], rays[camera][:, seen], scale)
     return _Support(float(weights.mean()) if len(seen) else 1.0, known, seen)

@@ -17,6 +17,8 @@ _MOST_LABELLINGS = 8
 _RARITY = 2.0
 """What an exchange in one camera and frame must bring, since it is rarer than none."""
 _MOST_KEYPOINTS = 4_000_000
+_LEAST_AGREEING, _AGREEING_SHARE = 3, 2 / 3
+"""Keypoints of a point, and share of those seen, that must agree with it for the labels of a frame to be beyond doubt."""
 _MOTION_WEIGHT = 1.5
 _MOTION_LENIENCE = 1.5
 
@@ -39,6 +41,10 @@ def exchanged_where(views: RayViews, pixels: Tensor, frames: Tensor, margin: flo
     """
     cameras, points = views.weights.shape[0], views.weights.shape[2]
     partner = torch.arange(points, device=pixels.device).roll(points // 2)
+    doubtful = torch.cat([_doubtful(views.at_frames(part), partner) for part in _parts(views)])
+    if not doubtful.any():
+        return pixels.new_zeros(cameras, pixels.shape[2]).bool()
+    frames, views = frames[doubtful], views.at_frames(doubtful)
     found = [_labellings(views.at_frames(part), partner) for part in _parts(views)]
     labellings = pixels.new_zeros(len(found[0][0]), cameras, pixels.shape[2]).bool()
     within = pixels.new_zeros(len(labellings), pixels.shape[2])
@@ -47,6 +53,19 @@ def exchanged_where(views: RayViews, pixels: Tensor, frames: Tensor, margin: flo
     motion = _motion_evidence(pixels, partner)
     chosen = _path(labellings, within.repeat(2, 1) - _RARITY * labellings.sum(1), motion)
     return _with_margin(chosen, views, partner, frames, motion, margin)
+
+
+def _doubtful(views: RayViews, partner: Tensor) -> Tensor:
+    """Whether the given labels of a frame may be wrong, (n,).
+
+    They are right where the rays of most cameras meet in each of the points, and no camera agrees better with these points if
+    its keypoints are exchanged.
+    """
+    points, everywhere = views.points(), torch.ones_like(views.weights[..., 0], dtype=torch.bool)
+    given, other = (v.evidence(points) for v in (views, views.exchanged(everywhere, partner)))
+    agreeing, seen = (given > 0).sum(0), (views.weights > 0).sum(0)
+    supported = (agreeing >= _LEAST_AGREEING) & (agreeing > _AGREEING_SHARE * seen)
+    return (other.sum(-1) > given.sum(-1)).any(0) | ~(supported | (seen < 2)).all(-1)
 
 
 def _labellings(views: RayViews, partner: Tensor) -> tuple[Tensor, Tensor]:

@@ -58,8 +58,8 @@ class RayViews:
         sigma = _LENIENCE * sigma_px / cameras.focal_px[:, None]
         return RayViews(rays.nan_to_num(), weights, state.rotations[0], state.translations[0], sigma)
 
-    def at_frames(self, frames: slice) -> RayViews:
-        """Some of the frames."""
+    def at_frames(self, frames: slice | Tensor) -> RayViews:
+        """Some of the frames, as a slice or a mask (n,)."""
         return replace(self, rays=self.rays[:, :, frames], weights=self.weights[:, frames])
 
     def at(self, points: Tensor) -> RayViews:

@@ -33,7 +33,7 @@ _SIGMAS_95 = 2.7955
 """Half the size of the ellipsoid that holds 95 % of a position in space, in standard deviations."""
 _FAR = 4.0
 """How many times as large as the scene the space is in which points are drawn."""
-_SEEN, _ASIDE, _RELABELLED = 1, 2, 3
+SEEN, ASIDE, RELABELLED = 1, 2, 3
 """Codes of a keypoint that was used, set aside, or used and relabelled; 0 is not seen."""
 
 
@@ -68,9 +68,9 @@ class Drawing:
     def codes(self) -> Tensor:
         """(C, F, P), what became of each keypoint."""
         c = self.calibration
-        codes = c.inliers.cpu().to(torch.uint8) * _SEEN
-        codes[(c.inliers & c.relabelled).cpu()] = _RELABELLED
-        codes[(keypoints_seen(c) & ~c.inliers).cpu()] = _ASIDE
+        codes = c.inliers.cpu().to(torch.uint8) * SEEN
+        codes[(c.inliers & c.relabelled).cpu()] = RELABELLED
+        codes[(keypoints_seen(c) & ~c.inliers).cpu()] = ASIDE
         return codes
 
     def common(self, own: Tensor, frames: Tensor, missing: Any) -> Tensor:

@@ -5,6 +5,7 @@ const space = document.getElementById('space');
 const tip = document.getElementById('tip');
 const [right, forward, up] = scene.axes;
 const TRAIL = 40;
+const NAME_PX = 30, MARGIN_PX = 34;
 const START = { yaw: 0.45, pitch: 0.3, distance: 2.1 };
 const orbit = { ...START };
 let fromCamera = null;
@@ -31,7 +32,7 @@ function magnification() {
   return wanted < 1 ? 1 : Math.round(power * (wanted >= 5 * power ? 5 : wanted >= 2 * power ? 2 : 1));
 }
 
-/** The view: three directions (right, up, away from the eye), the eye and the focal length in pixels. */
+/** The view: three directions (right, up, away from the eye), the eye, the focal length and the middle's height in pixels. */
 function view(width, height) {
   if (fromCamera !== null) {
     const [apex, first, second, , fourth] = corners[fromCamera];
@@ -40,15 +41,32 @@ function view(width, height) {
     const away = unit(sum(middle, apex, -1));
     const half = Math.hypot(...sum(second, first, -1)) / 2 / Math.hypot(...sum(middle, apex, -1));
     const tall = Math.hypot(...sum(fourth, first, -1)) / 2 / Math.hypot(...sum(middle, apex, -1));
-    return { x, y, away, eye: apex, focal: Math.min(width / 2 / half, height / 2 / tall) };
+    return { x, y, away, eye: apex, focal: Math.min(width / 2 / half, height / 2 / tall), horizon: height / 2 };
   }
-  const { yaw, pitch, distance } = orbit;
+  return { ...around(orbit), ...fitted(width, height) };
+}
+
+/** The focal length, and the height in the picture of the middle of the scene, with which all of it is seen at first. */
+function fitted(width, height) {
+  const seen = around(START);
+  const athlete = Array.from({ length: P }, (_, point) => pointAt(0, point)).filter(Boolean);
+  const places = [...corners.flat(), ...athlete].map((point) => {
+    const from = sum(point, seen.eye, -1), depth = dotted(from, seen.away);
+    return [dotted(from, seen.x) / depth, dotted(from, seen.y) / depth];
+  });
+  const half = Math.max(...places.map(([x]) => Math.abs(x)));
+  const top = Math.max(...places.map(([, y]) => y)), bottom = Math.min(...places.map(([, y]) => y));
+  const focal = Math.min((width / 2 - NAME_PX) / half, (height - 2 * MARGIN_PX) / (top - bottom), 2.5 * height);
+  return { focal, horizon: height / 2 + (focal * (top + bottom)) / 2 };
+}
+
+/** Three directions and the eye of a view onto the middle of the scene. */
+function around({ yaw, pitch, distance }) {
   const level = sum(scaled(forward, Math.cos(yaw)), right, Math.sin(yaw));
   const x = sum(scaled(right, Math.cos(yaw)), forward, -Math.sin(yaw));
   const away = sum(scaled(level, Math.cos(pitch)), up, -Math.sin(pitch));
   const y = sum(scaled(up, Math.cos(pitch)), level, Math.sin(pitch));
-  const eye = scaled(away, -distance * scene.radius);
-  return { x, y, away, eye, focal: Math.min(0.9 * width, 1.3 * height) };
+  return { x, y, away, eye: scaled(away, -distance * scene.radius) };
 }
 
 function drawScene(frame) {
@@ -56,12 +74,11 @@ function drawScene(frame) {
   if (!sheet) return;
   const { context, width, height } = sheet;
   const seen = view(width, height);
-  const horizon = fromCamera === null ? 0.43 : 0.5;
   const project = (point) => {
     const from = sum(point, seen.eye, -1);
     const depth = dotted(from, seen.away);
     if (depth < 0.02 * scene.radius) return null;
-    return [width / 2 + (seen.focal * dotted(from, seen.x)) / depth, horizon * height - (seen.focal * dotted(from, seen.y)) / depth, depth];
+    return [width / 2 + (seen.focal * dotted(from, seen.x)) / depth, seen.horizon - (seen.focal * dotted(from, seen.y)) / depth, depth];
   };
   const line = (a, b, ink, thick, strength = 1) => {
     const from = project(a), to = project(b);
@@ -114,9 +131,10 @@ function label(context, text, place, ink) {
   context.font = '12px system-ui, "DejaVu Sans", sans-serif';
   context.lineWidth = 3;
   context.strokeStyle = colour('wash');
-  context.strokeText(text, place[0] + 4, place[1] - 4);
+  const x = Math.max(2, Math.min(place[0] + 4, context.canvas.clientWidth - context.measureText(text).width - 2));
+  context.strokeText(text, x, place[1] - 4);
   context.fillStyle = ink;
-  context.fillText(text, place[0] + 4, place[1] - 4);
+  context.fillText(text, x, place[1] - 4);
 }
 
 /** Where the sticks were in the frames before and after, fainter the longer ago. */
