@@ -2,7 +2,7 @@
 
 Around each frame a track is a straight line plus a random smooth motion (a Gaussian process with a Matern covariance of
 smoothness 7/2). How fast and how far this motion goes is what makes the values around the frame most likely, given the noise of
-the keypoints. A resting stick is averaged over all frames around, a fast one over few. What smoothing leaves out has a known
+the keypoints. A stick at rest is averaged over all frames around, a fast one over few. What smoothing leaves out has a known
 size too: it is drawn together with the errors of the keypoints.
 """
 
