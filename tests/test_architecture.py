@@ -13,7 +13,7 @@ import torchstickcal
 ROOT = Path(__file__).parents[1]
 FLOORS = [
     ["errors", "workers", "processes", "lazy", "precision", "samples"],
-    ["files", "shapes", "arrays"],
+    ["files", "shapes", "arrays", "archives"],
     ["untrusted"],
     ["registry", "skeletons"],
     ["settings"],
@@ -33,7 +33,7 @@ FLOORS = [
     ["result", "reconstruction"],
     ["io"],
     ["pipeline.noise"],
-    ["pipeline.run", "pipeline.scale"],
+    ["pipeline.run", "pipeline.height", "pipeline.scale"],
     ["pipeline.stage"],
     ["pipeline.settle"],
     ["pipeline.initialise", "pipeline.synchronise"],

@@ -104,6 +104,14 @@ def test_a_calibration_file_or_a_session_of_any_name_is_evaluated(session: Path,
     assert main(["evaluate", str(tmp_path / "cameras.txt"), str(tmp_path / "truth"), "--format", "npz"]) == 0
 
 
+def test_the_earlier_name_of_write_still_works(session: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    assert main(["calibrate", str(session), "--out", str(tmp_path), "--export", "trc", "--refine", "none"]) == 0
+    assert (tmp_path / "points.trc").is_file()
+    with pytest.raises(SystemExit):
+        main(["calibrate", "--help"])
+    assert "--export" not in capsys.readouterr().out
+
+
 def test_tensorboard_log(session: Path, tmp_path: Path):
     main(["calibrate", str(session), "--out", str(tmp_path / "out"), "--tensorboard", str(tmp_path / "log")])
     assert len(list((tmp_path / "log").iterdir())) == 1
@@ -127,6 +135,7 @@ def test_benchmark(session: Path, tmp_path: Path, capsys: pytest.CaptureFixture[
 
 def test_demo(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     assert main(["demo", "--out", str(tmp_path / "demo")]) == 0
+    assert Calibration.load(tmp_path / "demo" / "points.npz").world.name == "athlete"
     shown = capsys.readouterr().out
     assert "Against the truth" in shown
     assert (tmp_path / "demo" / "rig.png").read_bytes().startswith(b"\x89PNG")
@@ -160,7 +169,7 @@ def write(path, calibration):
         (["calibrate", "SESSION", "--out", "out", "--refine", "time_offset", "--no-sync"], "got --refine time_offset"),
         (["calibrate", "SESSION", "--out", "out", "--format", "npx"], "Did you mean 'npz'"),
         (["calibrate", "SESSION", "--out", "out", "--format", "sports-stick-syn"], "a pickle file is damaged"),
-        (["calibrate", "SESSION", "--out", "out", "--export", "pose3sim"], "Did you mean 'pose2sim'"),
+        (["calibrate", "SESSION", "--out", "out", "--write", "pose3sim"], "Did you mean 'pose2sim'"),
         (["calibrate", "empty", "--out", "out"], "no session format is recognised (empty): got a folder"),
         (["evaluate", "SESSION", "broken.py"], "no calibration format or session format is recognised"),
         (["list", "--plugin", "absent.py"], "a plugin cannot be imported (--plugin absent.py): got FileNotFoundError"),
@@ -179,7 +188,7 @@ def write(path, calibration):
         (["simulate", "golf", "--out", "broken.py"], "results cannot be written"),
         (["benchmark", "EMPTY", "--count", "0"], "no sessions to measure"),
         (["benchmark", "hard", "--out", "out", "--jobs", "1000000"], "more processes than this machine can run (--jobs)"),
-        (["calibrate", "SESSION", "--out", "out", "--export", "broken", "--plugin", "writer.py"], "ZeroDivisionError: by zero"),
+        (["calibrate", "SESSION", "--out", "out", "--write", "broken", "--plugin", "writer.py"], "ZeroDivisionError: by zero"),
     ],
 )
 def test_errors_are_one_line_and_leave_nothing(
@@ -251,7 +260,7 @@ def test_an_unexpected_error_is_one_line_and_its_traceback_on_request(
 
     monkeypatch.setattr("torchstickcal.metrics.pose_errors", broken)
     assert main(["evaluate", str(session), str(session)]) == 2
-    assert capsys.readouterr().err.startswith("error: unexpected RuntimeError: two lines (TORCHSTICKCAL_TRACEBACK=1")
+    assert capsys.readouterr().err.startswith("error: unexpected RuntimeError: two lines (--debug shows where)")
     monkeypatch.setenv("TORCHSTICKCAL_TRACEBACK", "1")
     assert main(["evaluate", str(session), str(session)]) == 2
     assert "in broken" in capsys.readouterr().err

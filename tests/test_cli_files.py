@@ -96,6 +96,20 @@ def test_info(sample: Path, tmp_path: Path, capsys):
     assert seen["club_head"]["cam01"] > 0.9
 
 
+def test_info_says_what_accuracy_to_expect(sample: Path, results: Path, tmp_path: Path, capsys):
+    """From the standard deviation by some frames; all frames together do better."""
+    command = ["info", str(sample), "--skeleton", str(sample / "skeleton.toml"), "--json", str(tmp_path / "i.json")]
+    assert main([*command, *STICK]) == 0
+    expected = json.loads((tmp_path / "i.json").read_text())["expected"]
+    std_mm = f"{1000 * expected['position_std_m']:.2g} mm"
+    said = f"Expected accuracy: standard deviation of the camera positions {std_mm}, by 60 of 90 frames"
+    assert said in capsys.readouterr().out
+    reached = float(Calibration.load(results / "points.npz").camera_std_m[1:].mean())
+    assert 0.5 * expected["position_std_m"] < reached < expected["position_std_m"]
+    assert main(command) == 0
+    assert "Expected accuracy: not known, because no stick is given" in capsys.readouterr().out
+
+
 def test_info_counts_what_is_there(tmp_path: Path):
     observations, truth = golf_session(cameras=3, frames=20)
     observations.keypoints[2] = float("nan")
@@ -107,6 +121,7 @@ def test_info_counts_what_is_there(tmp_path: Path):
     pairs = {tuple(pair["cameras"]): pair["keypoints"] for pair in found["pairs"]}
     assert pairs[("cam01", "cam02")] == int((observations.visible[0] & observations.visible[1]).sum())
     assert pairs[("cam02", "cam03")] == 1
+    assert set(found["expected"]) == {"unknown"}
     assert found["sticks"] == [{"start": "club_grip", "end": "club_head", "length_m": 1.0, "frames": 20}]
 
 

@@ -68,7 +68,7 @@ def test_format(tmp_path: Path):
     for camera, keypoints in zip("abc", observations.keypoints, strict=True):
         np.savetxt(folder / f"{camera}.track", keypoints[:, [*range(15), -2, -1]].flatten(1))
     out = tmp_path / "results"
-    arguments = ["calibrate", str(folder), "--out", str(out), "--export", "positions", *plugin("tracks", tmp_path)]
+    arguments = ["calibrate", str(folder), "--out", str(out), "--write", "positions", *plugin("tracks", tmp_path)]
     main(arguments)
     calibration = Calibration.load(out / "points.npz")
     assert calibration.camera_names == ("a", "b", "c")

@@ -5,12 +5,13 @@ from __future__ import annotations
 import dataclasses
 import json
 import os
+import pickle
 import signal
 import subprocess
 import sys
 import time
 from collections.abc import Iterator
-from concurrent.futures import Executor, Future, ThreadPoolExecutor
+from concurrent.futures import BrokenExecutor, Executor, Future, ThreadPoolExecutor
 from functools import partial
 from html.parser import HTMLParser
 from pathlib import Path
@@ -20,6 +21,7 @@ import pytest
 import torch
 
 from torchstickcal import (
+    Calibration,
     CalibrationError,
     FileFormatError,
     Observations,
@@ -33,11 +35,11 @@ from torchstickcal.cli import main
 from torchstickcal.cli.arguments import parser
 from torchstickcal.cli.calibrate_many import _Writing
 from torchstickcal.io import Given, write_npz
-from torchstickcal.many import SessionFile, SessionRow, read_manifests, session_files
+from torchstickcal.many import SessionFile, SessionRow, engine, many, read_manifests, session_files, tables
 from torchstickcal.many.manifest import open_manifest
 from torchstickcal.many.memory import Budget, needed_bytes
 from torchstickcal.many.sources import Source, sources_of
-from torchstickcal.many.task import Settings, folder_of
+from torchstickcal.many.task import Performed, Settings, Task, failed_row, folder_of, perform
 from torchstickcal.processes import SPAWN
 from torchstickcal.simulate import Noise, golf_session
 
@@ -48,15 +50,19 @@ def swing(seed: int) -> Observations:
     return golf_session(cameras=3, frames=8 + seed, noise=Noise(0.5), seed=seed)[0]
 
 
+def _blind(observations: Observations) -> Observations:
+    """The session, of which no camera sees anything."""
+    return dataclasses.replace(observations, keypoints=torch.full_like(observations.keypoints, torch.nan))
+
+
 def no_swing(error: str) -> Observations:
     raise ValueError(error)
 
 
-def deadly(marks: Path, times: int, seed: int) -> Observations:
-    """A session whose first processes are killed while they have it."""
-    deaths = len(list(marks.iterdir()))
-    if deaths < times:
-        (marks / str(deaths)).touch()
+def deadly(marks: Path, seed: int) -> Observations:
+    """A session whose first process is killed while it has it."""
+    if not any(marks.iterdir()):
+        (marks / "dead").touch()
         os.kill(os.getpid(), signal.SIGKILL)
     return swing(seed)
 
@@ -222,31 +228,108 @@ def test_files_that_cannot_be_written_together_are_refused_before_anything_is_ca
         ResultFiles(formats)
 
 
+# --- small sessions together -------------------------------------------------------------------------------------------------
+
+
+def group(sessions: dict[str, Any], out: Path | None = None, memory_bytes: int | None = None) -> tuple[Task, ...]:
+    settings = pickle.dumps(Settings(load_config("default"), None, out, ResultFiles(page=False), memory_bytes))
+    return tuple(Task(Source(name, session), "", None, settings) for name, session in sessions.items())
+
+
+def test_a_group_has_the_results_of_its_sessions_alone(tmp_path: Path):
+    alike = {str(seed): golf_session(cameras=3, frames=8, noise=Noise(0.5), seed=seed)[0] for seed in range(3)}
+    sessions = alike | {"other": swing(1), "raises": partial(no_swing, "no"), "no rig": _blind(swing(0)), "last": swing(0)}
+    performed = perform(group(sessions, tmp_path))
+    assert [row.name for row, _ in performed.done] == list(sessions)
+    singly = [perform(group({name: session})).done[0] for name, session in sessions.items()]
+    for (row, _), (alone, calibration) in zip(performed.done, singly, strict=True):
+        assert (row.outcome, row.status, row.error, row.verdict) == (alone.outcome, alone.status, alone.error, alone.verdict)
+        if calibration is not None:
+            found = Calibration.load(tmp_path / str(row.folder) / "points.npz")
+            torch.testing.assert_close(found.points, calibration.points, rtol=0, atol=1e-12, equal_nan=True)
+            torch.testing.assert_close(found.rotations, calibration.rotations, rtol=0, atol=1e-12)
+    assert [row.outcome for row, _ in performed.done].count("failed") == 2
+
+
+def test_a_large_session_of_a_group_is_left_for_a_call_of_its_own():
+    small, large = swing(0), golf_session(cameras=6, frames=140)[0]
+    assert perform(group({"large": large, "small": small})) == ([], 1)
+    performed = perform(group({"raises": partial(no_swing, "no"), "small": small, "large": large, "last": small}))
+    assert [row.name for row, _ in performed.done] == ["raises", "small"]
+
+
+def test_a_group_takes_no_more_memory_than_is_allowed():
+    sessions = {str(seed): swing(seed) for seed in range(3)}
+    two = needed_bytes(*list(sessions.values())[:2])
+    assert [len(perform(group(sessions, None, memory)).done) for memory in (two, two - 1)] == [2, 1]
+
+
 # --- what is interrupted -----------------------------------------------------------------------------------------------------
 
 
 @KILLS
-def test_a_killed_worker_costs_no_session_and_a_deadly_session_no_other(tmp_path: Path):
-    def deadly_session(times: int) -> Any:
-        marks = tmp_path / f"marks{times}"
-        marks.mkdir()
-        return partial(deadly, marks, times, 0)
-
-    sessions = {"once": deadly_session(1), "always": deadly_session(99), "cannot be sent": lambda: swing(0)} | SWINGS
-    done = calibrate_many(sessions, out=tmp_path / "out", jobs=2)
-    assert [row.outcome for row in done.rows] == ["converged", "failed", "failed", *["converged"] * len(SWINGS)]
-    assert "was killed 3 times" in str(done.rows[1].error)
-    assert "pickle" in str(done.rows[2].error)
+def test_a_killed_worker_costs_no_session(tmp_path: Path):
+    marks = tmp_path / "marks"
+    marks.mkdir()
+    sessions = {"once": partial(deadly, marks, 0), "cannot be sent": lambda: swing(0), "other": SWINGS["swing 1"]}
+    done = calibrate_many(sessions, out=tmp_path / "out", jobs=1)
+    assert [row.outcome for row in done.rows] == ["converged", "failed", "converged"]
+    assert "pickle" in str(done.rows[1].error)
     assert (tmp_path / "out" / "manifest.jsonl").read_text().count("\n") == len(sessions)
+
+
+class Mortal:
+    """Processes of which one is killed when it begins with a session that has deaths left."""
+
+    def __init__(self, deaths: dict[str, int], groups: list[int]) -> None:
+        self.deaths, self.groups = deaths, groups
+
+    def __call__(self, *_: Any) -> Mortal:
+        self.alive = True
+        return self
+
+    def __enter__(self) -> Mortal:
+        return self
+
+    def __exit__(self, *_: Any) -> None:
+        pass
+
+    def submit(self, _: Any, group: tuple[Task, ...]) -> Future[Performed]:
+        future: Future[Performed] = Future()
+        self.groups.append(len(group))
+        for task in group if self.alive else ():
+            if self.deaths.get(task.source.name, 0):
+                self.deaths[task.source.name] -= 1
+                self.alive = False
+        if self.alive:
+            future.set_result(Performed([(failed_row(task, "done"), None) for task in group], together=5))
+        else:
+            future.set_exception(BrokenExecutor())
+        return future
+
+
+@pytest.mark.parametrize(
+    "deaths", [{}, {0: 1}, {3: 99}, {7: 1, 9: 2}, {6: 99, 7: 99}, {12: 3, 19: 1}, dict.fromkeys(range(20), 1)]
+)
+@pytest.mark.parametrize("count", [1, 3])
+def test_a_deadly_session_costs_no_other(deaths: dict[int, int], count: int, monkeypatch: pytest.MonkeyPatch):
+    groups: list[int] = []
+    monkeypatch.setattr(engine, "_started", Mortal({str(n): times for n, times in deaths.items()}, groups))
+    tasks = [Task(Source(str(n), str), "", None, b"") for n in range(20)]
+    rows = [row for done in engine.on_processes(iter(tasks), count, None, None) for row, _ in done]
+    assert sorted(int(row.name) for row in rows) == list(range(20))
+    errors = {int(row.name): str(row.error) for row in rows}
+    for number in range(20):
+        assert ("was killed 3 times" in errors[number]) == (deaths.get(number, 0) >= 3)
+    assert max(groups) == (5 if len(deaths) < 20 else 1)  # 5 as soon as it is known that the sessions are small
 
 
 RUN = """
 import sys
-from test_many import SWINGS, swing
-from functools import partial
+from test_many import SWINGS
 from torchstickcal import calibrate_many
 if __name__ == "__main__":
-    calibrate_many({f"swing {seed}": partial(swing, seed % 3) for seed in range(6)}, out=sys.argv[1], jobs=2)
+    calibrate_many(SWINGS, out=sys.argv[1], jobs=1)
 """
 
 
@@ -255,23 +338,38 @@ def test_when_everything_is_killed_the_same_call_goes_on(tmp_path: Path):
     (tmp_path / "run.py").write_text(RUN)
     paths = os.pathsep.join([str(Path(__file__).parent), os.environ.get("PYTHONPATH", "")])
     command = [sys.executable, tmp_path / "run.py", tmp_path / "out"]
-    run = partial(subprocess.Popen, command, stderr=subprocess.PIPE, env=os.environ | {"PYTHONPATH": paths})
     manifest = tmp_path / "out" / "manifest.jsonl"
-    parent = run()
-    while not (manifest.exists() and manifest.read_bytes().count(b"\n") >= 2):
-        assert parent.poll() is None
-        time.sleep(0.02)
-    parent.kill()
-    parent.communicate(timeout=20)  # ends when every process that can write to the pipe has ended
+    with subprocess.Popen(command, stderr=subprocess.PIPE, env=os.environ | {"PYTHONPATH": paths}) as parent:
+        while not (manifest.exists() and manifest.read_bytes().count(b"\n") >= 1):
+            assert parent.poll() is None
+            time.sleep(0.01)
+        parent.kill()
+        parent.communicate(timeout=20)  # ends when every process that can write to the pipe has ended
     before = manifest.read_bytes()
     manifest.write_bytes(before + b'{"name": "swing 1')  # as if it had been killed while it wrote
-    assert run().communicate(timeout=120) == (None, b"")
+    with ThreadPoolExecutor(1) as pool:
+        calibrate_many(SWINGS, executor=pool, out=tmp_path / "out")
     after = manifest.read_bytes()
     assert after.startswith(before)
     names = [json.loads(line)["name"] for line in after.splitlines()]
-    assert sorted(names) == sorted(f"swing {seed}" for seed in range(6))
+    assert sorted(names) == sorted(SWINGS)
     left = {path.name for path in (tmp_path / "out" / "results").rglob("*") if path.name.startswith(".")}
     assert not left
+
+
+@pytest.mark.parametrize("count", [3, 30])
+def test_the_manifests_are_read_no_oftener_for_more_sessions(count: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    reads: list[Path] = []
+
+    def counted(folder: Path) -> dict[str, SessionRow]:
+        reads.append(folder)
+        return read_manifests(folder)
+
+    for module in (many, tables):
+        monkeypatch.setattr(module, "read_manifests", counted)
+    with ThreadPoolExecutor(1) as pool:
+        done = calibrate_many([tmp_path / str(number) for number in range(count)], executor=pool, out=tmp_path / "out")
+    assert (len(done.rows), len(reads)) == (count, 2)
 
 
 def test_a_manifest_is_written_by_one_run_at_a_time(tmp_path: Path):

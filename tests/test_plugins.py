@@ -115,9 +115,9 @@ def session(tmp_path: Path) -> Path:
 
 def test_formats(plugin: str, session: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     out = tmp_path / "out"
-    assert main(["calibrate", str(session), "--out", str(out), "--export", "toy_names"]) == 2
+    assert main(["calibrate", str(session), "--out", str(out), "--write", "toy_names"]) == 2
     assert "no session format is recognised" not in capsys.readouterr().err
-    command = ["calibrate", str(session), "--out", str(out), "--export", "toy_names", "--plugin", plugin]
+    command = ["calibrate", str(session), "--out", str(out), "--write", "toy_names", "--plugin", plugin]
     assert main(command) == 0
     assert "calibration.toml, names.txt, points.npz, report.json, report.html in" in capsys.readouterr().out
     assert (out / "names.txt").read_text() == "cam01 cam02 cam03"
@@ -138,7 +138,7 @@ def test_a_session_of_one_s_own_format_is_measured(plugin: str, session: Path, t
 
 def test_two_files_of_one_name_are_refused(plugin: str, session: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     out = tmp_path / "out"
-    assert main(["calibrate", str(session), "--out", str(out), "--export", "toy_report", "--plugin", plugin]) == 2
+    assert main(["calibrate", str(session), "--out", str(out), "--write", "toy_report", "--plugin", plugin]) == 2
     assert "two files of one name (--write toy_report): got report.json" in capsys.readouterr().err
     assert not out.exists()
 

@@ -7,6 +7,7 @@ import json
 import pickle
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -18,6 +19,7 @@ from torchstickcal.cli import main
 from torchstickcal.errors import ObservationError
 from torchstickcal.geometry import se3
 from torchstickcal.io import write_npz
+from torchstickcal.quality.lags import frames_are_apart
 from torchstickcal.quality.linear import FramePulls
 from torchstickcal.quality.moved import motion_of
 from torchstickcal.quality.registry import FAMILIES, findings
@@ -256,3 +258,13 @@ def test_command_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     capsys.readouterr()
     assert main(["evaluate", out, good]) == 0
     assert "aligned before the comparison: all 5 camera centres" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(("cameras", "late", "apart"), [(4, 0, False), (4, 4, True), (2, 0, None)])
+def test_equal_frames_are_compared_with_others(cameras: int, late: int, apart: bool | None):
+    observations = session("kendo", cameras).observations
+    keypoints = observations.keypoints.clone()
+    keypoints[1] = keypoints[1].roll(late, 0)
+    judgement = calibrate(replace(observations, keypoints=keypoints)).judgement
+    assert isinstance(judgement, partial)
+    assert frames_are_apart(judgement.args[0]) is apart

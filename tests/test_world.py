@@ -199,6 +199,16 @@ def test_the_vertical_survives_points_that_are_never_known(calibration: Calibrat
     assert error_deg(moved.rotations[0].mT @ whole.rotations[0][:, 2], torch.tensor([0, 0, 1.0]).double()) < 2.0
 
 
+@pytest.mark.parametrize("every", [2, 5, 30])
+def test_the_vertical_survives_frames_in_which_a_foot_is_not_known(calibration: Calibration, every: int):
+    """Also where a foot is still before and after such a frame."""
+    points = calibration.points.clone()
+    ankle = calibration.point_names.index("left_ankle")
+    points[:, ankle] = points[0, ankle]
+    points[::every, ankle] = torch.nan
+    assert replace(calibration, points=points).in_world("athlete").rotations.isfinite().all()
+
+
 def test_one_frame_is_enough(calibration: Calibration):
     points = calibration.points.clone()
     points[1:] = torch.nan

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 import typing
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from importlib import resources
 from pathlib import Path
@@ -18,7 +18,7 @@ import torch
 from torch import Tensor
 
 from torchstickcal.errors import ConfigError
-from torchstickcal.files import parse_toml
+from torchstickcal.files import parse_toml, toml_text
 from torchstickcal.losses import LOSSES, CameraPointLoss, LossSettings, ReprojectionSettings
 from torchstickcal.model.unknowns import REFINEMENTS
 from torchstickcal.registry import suggestion
@@ -26,7 +26,8 @@ from torchstickcal.settings import Positive, PositiveInt, build, build_dataclass
 from torchstickcal.untrusted import read_bytes
 
 _EXTENDS = "extends"
-
+_SET = "--set"
+_HEIGHTS_M = 0.5, 2.5
 
 Refine = Annotated[str, REFINEMENTS]
 """A name in :data:`torchstickcal.model.unknowns.REFINEMENTS`."""
@@ -127,6 +128,7 @@ class Config:
         incomplete: what to do with cameras that share too little to be one rig: ``refuse`` them, or calibrate the ``largest``
             part of them alone and name the others.
         scale: a length between points that sets the scale instead of the sticks.
+        height_m: body height of the athlete, metres, which sets the scale where neither ``scale`` nor a stick does.
         refine: what else is estimated of the cameras, in every stage that estimates them; ``auto`` for what the keypoints
             contradict.
         camera_groups: a label for each camera; cameras with the same label share what is shared. Empty: all cameras do.
@@ -154,12 +156,24 @@ class Config:
     relabel: bool = False
     incomplete: Literal["refuse", "largest"] = "refuse"
     scale: ScaleSettings | None = None
+    height_m: Positive | None = None
     refine: list[Refine] | Literal["auto"] = field(default_factory=list)
     camera_groups: list[str] = field(default_factory=list)
     synchronise: bool = True
     max_offset_s: Positive = 2.0
     noise: Literal["estimated", "given"] = "estimated"
     sigma_px: Positive | list[Positive] = 1.0
+
+    def __post_init__(self) -> None:
+        least, most = _HEIGHTS_M
+        if self.height_m is not None and not least <= self.height_m <= most:
+            raise ConfigError(
+                "not the height of a person",
+                where="height_m",
+                got=self.height_m,
+                expected=f"{least:g} to {most:g}",
+                remedy="Give it in metres.",
+            )
 
     @property
     def given_sigma_px(self) -> Tensor | None:
@@ -198,11 +212,38 @@ def load_config(config: str | Path | Mapping[str, Any] | Config = "default") -> 
     if not isinstance(config, str | Path | Mapping):
         expected = "the name of a configuration, a TOML file, a mapping of its keys, or a Config"
         raise ConfigError("not a configuration", where="config", got=type(config).__name__, expected=expected)
-    where = "mapping" if isinstance(config, Mapping) else str(config)
-    built: Config = build(Config, _keys(config, Path(), ()), where, ())
-    if not built.stages:
-        raise ConfigError("nothing to do", where=f"{where}: stages", got="no stage", expected="at least one")
-    return built
+    return _built(_keys(config, Path(), ()), "mapping" if isinstance(config, Mapping) else str(config))
+
+
+def with_settings(config: Config, settings: Sequence[str]) -> Config:
+    """A configuration with some of its keys set, each by a line of TOML; a later line has precedence.
+
+    Raises:
+        ConfigError: if a line is not one key with its value, and as for :func:`load_config`.
+
+    Example:
+        >>> changed = with_settings(load_config("default"), ["stages.metric.reject_sigmas = 5", "relabel = false"])
+        >>> changed.stages["metric"].reject_sigmas, changed.relabel
+        (5.0, False)
+    """
+    keys = _tables(config)
+    for line in settings:
+        changes = _setting(line)
+        _check_stage_names(keys, changes, _SET)
+        keys = _merged(keys, changes)
+    return _built(keys, _SET) if settings else config
+
+
+def config_toml(config: Config) -> str:
+    """A configuration with all its keys as TOML, from which :func:`load_config` reads an equal one.
+
+    Example:
+        >>> print(config_toml(load_config("paper"))[:60])
+        points = "all"
+        solver = "gauss_newton"
+        precision = "float64"
+    """
+    return toml_text(_tables(config))
 
 
 def with_noise(config: Config, noise: Any) -> Config:
@@ -222,6 +263,50 @@ def with_refine(config: Config, refine: Any) -> Config:
     """
     chosen = build(typing.get_type_hints(Config, include_extras=True)["refine"], refine, "calibrate", ("refine",))
     return dataclasses.replace(config, refine=chosen)
+
+
+def _built(keys: Mapping[str, Any], where: str) -> Config:
+    """The configuration of some keys; ``where`` they come from is for messages."""
+    built: Config = build(Config, keys, where, ())
+    if not built.stages:
+        raise ConfigError("nothing to do", where=f"{where}: stages", got="no stage", expected="at least one")
+    return built
+
+
+def _tables(settings: Any) -> dict[str, Any]:
+    """Settings as the tables from which they are built; the losses of a stage stand among its own keys."""
+    tables = {field.name: _as_value(getattr(settings, field.name)) for field in dataclasses.fields(settings)}
+    if isinstance(settings, Stage):
+        tables |= {"reprojection": False} | tables.pop("losses")
+    return tables
+
+
+def _as_value(value: Any) -> Any:
+    if dataclasses.is_dataclass(value):
+        return _tables(value)
+    if isinstance(value, Mapping):
+        return {key: _as_value(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_as_value(item) for item in value]
+    return False if value is None else value
+
+
+def _setting(line: str) -> dict[str, Any]:
+    """The key, within its tables, that a line of TOML sets."""
+    try:
+        found = parse_toml(line.encode())
+        why = "" if found and len(line.splitlines()) == 1 and not line.lstrip().startswith("[") else "not one key with a value"
+    except ValueError as error:
+        found, why = {}, str(error)
+    if why:
+        raise ConfigError(
+            "a setting is not KEY=VALUE",
+            where=_SET,
+            got=f"{line!r}: {why}",
+            expected="a key and its value as in a configuration file, such as stages.metric.reject_sigmas=5",
+            remedy="""A text is in quotation marks of its own: 'points="sticks"'.""",
+        )
+    return found
 
 
 def _keys(config: str | Path | Mapping[str, Any], folder: Path, extending: tuple[str, ...]) -> dict[str, Any]:

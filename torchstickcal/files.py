@@ -6,10 +6,11 @@ import errno
 import json
 import math
 import os
+import re
 import shutil
 import tempfile
 import tomllib
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
@@ -26,6 +27,8 @@ CAMERAS_FILE, POINTS_FILE, REPORT_FILE, PAGE_FILE = "calibration.toml", "points.
 RERUN_FILE = "scene.rrd"
 """A recording for the Rerun viewer, of results for which it is asked."""
 
+_BARE_KEY = re.compile(r"[A-Za-z0-9_-]+")
+"""A key that TOML writes without quotation marks."""
 _TEMPORARY = ".torchstickcal-"
 _CANNOT_SYNC = {errno.EINVAL, errno.ENOTSUP, errno.ENOSYS, errno.EBADF}
 """What file systems without fsync, or without fsync of folders, answer."""
@@ -175,6 +178,49 @@ def parse_toml(content: bytes) -> dict[str, Any]:
         raise ValueError(f"a byte at position {error.start} that is not UTF-8; save the file as UTF-8") from error
     except RecursionError as error:
         raise ValueError("brackets within brackets, too many to be read") from error
+
+
+def toml_text(tables: Mapping[str, Any]) -> str:
+    """TOML of tables within tables, whose values are texts, numbers, true, false, and lists of these.
+
+    Example:
+        >>> print(toml_text({"relabel": True, "stages": {"metric": {"reject_sigmas": 6.0, "refine": ["focal"]}}}))
+        relabel = true
+        <BLANKLINE>
+        [stages.metric]
+        reject_sigmas = 6.0
+        refine = ["focal"]
+        <BLANKLINE>
+    """
+    return "\n".join(text for text in _toml_tables(tables, ()) if text)
+
+
+def toml_string(text: str) -> str:
+    """A text as TOML: JSON, with the one character escaped that JSON allows and TOML does not."""
+    return json.dumps(text, ensure_ascii=False).replace("\x7f", "\\u007f")
+
+
+def _toml_tables(table: Mapping[str, Any], path: tuple[str, ...]) -> Iterator[str]:
+    """The texts of a table and of those within it, by the keys that lead to it."""
+    values = {key: value for key, value in table.items() if not isinstance(value, Mapping)}
+    lines = [f"{_toml_key(key)} = {_toml_value(value)}\n" for key, value in values.items()]
+    header = f"[{'.'.join(map(_toml_key, path))}]\n" if path and (lines or not table) else ""
+    yield header + "".join(lines)
+    for key, value in table.items():
+        if isinstance(value, Mapping):
+            yield from _toml_tables(value, (*path, key))
+
+
+def _toml_key(key: str) -> str:
+    return key if _BARE_KEY.fullmatch(key) else toml_string(key)
+
+
+def _toml_value(value: Any) -> str:
+    if isinstance(value, str):
+        return toml_string(value)
+    if isinstance(value, list | tuple):
+        return f"[{', '.join(map(_toml_value, value))}]"
+    return str(value).lower() if isinstance(value, bool) else repr(value)
 
 
 @contextmanager

@@ -14,6 +14,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from torchstickcal.archives import save_arrays
 from torchstickcal.arrays import FARTHEST_PX, number_of, tensor_of
 from torchstickcal.errors import CalibrationError, ObservationError
 from torchstickcal.files import atomic_path
@@ -445,7 +446,7 @@ class Calibration:
             "world": dataclasses.asdict(self.world),
         }
         with atomic_path(path) as temporary, temporary.open("wb") as file:
-            np.savez_compressed(file, meta=np.array(json.dumps(meta)), **arrays)
+            save_arrays(file, arrays | {"meta": np.array(json.dumps(meta))})
 
     @staticmethod
     def load(path: str | Path) -> Calibration:

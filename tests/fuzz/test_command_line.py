@@ -16,7 +16,7 @@ from torchstickcal.cli import main
 from torchstickcal.cli.arguments import parser
 
 
-@budget(small=15, large=500)
+@budget(small=30, large=500)
 @given(words=command_lines())
 def test_command_lines(words: list[str]):
     with tempfile.TemporaryDirectory() as folder, contextlib.chdir(folder):

@@ -15,10 +15,11 @@ from torchstickcal.benchmark.baselines import (
 )
 from torchstickcal.benchmark.bound import Bound, camera_bound
 from torchstickcal.benchmark.cases import Case, Source, sources
+from torchstickcal.benchmark.external import ExternalPoses
 from torchstickcal.benchmark.methods import METHODS, Method, method
 from torchstickcal.benchmark.page import write_results
 from torchstickcal.benchmark.run import Row, run_benchmark
-from torchstickcal.benchmark.scores import SequenceScore, score_sequence, summarise
+from torchstickcal.benchmark.scores import SequenceScore, score_external, score_sequence, summarise
 
 __all__ = [
     "BASELINES",
@@ -27,6 +28,7 @@ __all__ = [
     "Bound",
     "Case",
     "Estimate",
+    "ExternalPoses",
     "Inputs",
     "Listing",
     "Method",
@@ -39,6 +41,7 @@ __all__ = [
     "camera_bound",
     "method",
     "run_benchmark",
+    "score_external",
     "score_sequence",
     "sources",
     "summarise",

@@ -32,6 +32,7 @@ class Method:
             from the truth, instead of the athlete's stature.
         frames: number of frames of a session that it is given, from the first one; None for all.
         profiled: whether its memory is measured too, in calls of their own.
+        timed: whether its run time says something: not where it only reads what was computed elsewhere.
     """
 
     listing: Listing
@@ -39,6 +40,7 @@ class Method:
     height_in_motion: bool = False
     frames: int | None = None
     profiled: bool = False
+    timed: bool = True
 
     @property
     def title(self) -> str:
@@ -47,7 +49,7 @@ class Method:
 
     def inputs(self, case: Case) -> Inputs:
         """What the method may use of a case."""
-        given = Inputs(case.observations, height_m=case.height_m, cube=case.cube)
+        given = Inputs(case.observations, height_m=case.height_m, cube=case.cube, case=case.name)
         names, points = case.observations.point_names, case.truth.points
         if names is None or points is None or "head_top" not in names:
             return replace(given, height_m=None)
@@ -76,6 +78,10 @@ class _Methods(Mapping[str, Method]):
 
 METHODS: Mapping[str, Method] = _Methods()
 """All methods by name: the library's configurations, the baselines, and variants of both."""
+
+
+EXTERNAL: dict[str, Method] = {}
+"""Methods that only read what was computed elsewhere, while there are some (:mod:`torchstickcal.benchmark.external`)."""
 
 
 def method(name: str) -> Method:
@@ -110,7 +116,7 @@ def _all_methods() -> dict[str, Method]:
         )
     own = {name: method for name, method in configured.items() if method.listing.position >= OWN_CONFIGURATIONS}
     by_position = dict(sorted((configured | baselines).items(), key=lambda item: item[1].listing.position))
-    return own | by_position | _in_motion() | _shortened()
+    return own | by_position | _in_motion() | _shortened() | EXTERNAL
 
 
 def _configured(config: str) -> Method:

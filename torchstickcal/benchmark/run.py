@@ -14,11 +14,11 @@ from typing import NamedTuple
 
 import torch
 
-from torchstickcal.benchmark.baselines import Inputs, MissingInputError
+from torchstickcal.benchmark.baselines import Estimate, Inputs, MissingInputError
 from torchstickcal.benchmark.bound import Bound, camera_bound
 from torchstickcal.benchmark.cases import Case, Source
 from torchstickcal.benchmark.memory import Memory, input_bytes, memory_needed
-from torchstickcal.benchmark.methods import Method, method
+from torchstickcal.benchmark.methods import EXTERNAL, Method, method
 from torchstickcal.errors import CalibrationError, FileFormatError
 from torchstickcal.files import json_text
 from torchstickcal.metrics import PoseErrors, pose_errors
@@ -73,7 +73,7 @@ def run_benchmark(
     progress: Progress | None = None,
     prepare: Callable[[], object] | None = None,
 ) -> list[Row]:
-    """Measure methods on cases, except for what the folder ``out`` already holds.
+    """Measure methods on cases, except for what the folder ``out`` already holds. Poses from elsewhere are compared each time.
 
     Each measurement is written to a file in ``out`` at once, so that an interrupted run can be repeated and continues.
 
@@ -111,7 +111,7 @@ def run_benchmark(
         method(name)
     out.mkdir(parents=True, exist_ok=True)
     file = out / ROWS_FILE
-    known = {(row.case, row.method): row for row in read_rows(file)}
+    known = {(row.case, row.method): row for row in read_rows(file) if row.method not in EXTERNAL}
     places = {row.place for row in known.values()} - {place}
     if places:
         raise CalibrationError(
@@ -202,17 +202,24 @@ def _called(name: str, measured: Method, case: Case) -> _Result:
         _warm_up(name, measured, inputs)
         start = time.perf_counter()
         estimate = measured.estimate(inputs)
-        seconds = time.perf_counter() - start
+        seconds = time.perf_counter() - start if measured.timed else None
         outcome, errors = FAILED, None
         if bool(estimate.translations.isfinite().all()):
             outcome = CONVERGED if estimate.status == "converged" else NOT_CONVERGED
-            errors = pose_errors(estimate.rotations, estimate.translations, case.truth.rotations, case.truth.translations)
+            errors = errors_of(estimate, case)
         needed = memory_needed(partial(measured.estimate, inputs)) if measured.profiled else None
         return _Result(outcome, estimate.status, seconds, errors, needed)
     except MissingInputError as error:
         return _Result(LACKS_INPUT, str(error))
     except Exception as error:
         return _Result(FAILED, f"{type(error).__name__}: {error}".splitlines()[0], seconds)
+
+
+def errors_of(estimate: Estimate, case: Case) -> PoseErrors:
+    """The errors of a method on a case; the size of the rig is fitted to the truth where the method does not say it."""
+    alignment = "similarity" if estimate.up_to_scale else "rigid"
+    truth = case.truth
+    return pose_errors(estimate.rotations, estimate.translations, truth.rotations, truth.translations, alignment)
 
 
 def _measured(

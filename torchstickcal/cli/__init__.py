@@ -8,9 +8,11 @@ import sys
 import traceback
 import warnings
 from collections.abc import Sequence
+from contextlib import nullcontext
 
 from torchstickcal.cli.arguments import parser
-from torchstickcal.cli.console import console
+from torchstickcal.cli.configuration import print_config
+from torchstickcal.cli.console import console, quiet
 from torchstickcal.cli.outputs import EXIT_INTERRUPTED, EXIT_UNUSABLE
 from torchstickcal.cli.plugins import import_plugins
 from torchstickcal.errors import CalibrationError
@@ -20,8 +22,8 @@ _TRACEBACK = "TORCHSTICKCAL_TRACEBACK"
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run a command. An error is one line on standard error; ``TORCHSTICKCAL_TRACEBACK=1`` in the environment also shows where
-    it was raised.
+    """Run a command. An error is one line on standard error; ``--debug`` also shows where it was raised, and so does
+    ``TORCHSTICKCAL_TRACEBACK=1`` in the environment.
 
     Args:
         arguments: of the command line; None for those of the process.
@@ -63,21 +65,25 @@ def program() -> int:
 
 def _run(arguments: Sequence[str] | None) -> int:
     options = parser().parse_args(arguments)
+    debug = options.debug or bool(os.environ.get(_TRACEBACK))
     try:
         import_plugins(options.plugin)
-        return options.run(options)
+        if getattr(options, "print_config", False):
+            return print_config(options)
+        with quiet() if options.quiet else nullcontext():
+            return options.run(options)
     except KeyboardInterrupt:
         print("interrupted", file=sys.stderr)
         return EXIT_INTERRUPTED
     except (CalibrationError, OSError) as error:
-        return _failed(str(error))
+        return _failed(str(error), debug)
     except Exception as error:
-        return _failed(f"unexpected {type(error).__name__}: {error} ({_TRACEBACK}=1 in the environment shows where)")
+        return _failed(f"unexpected {type(error).__name__}: {error} (--debug shows where)", debug)
 
 
-def _failed(message: str) -> int:
+def _failed(message: str, debug: bool = False) -> int:
     """Show an error, with its traceback if that is asked for; returns the exit status."""
-    if os.environ.get(_TRACEBACK):
+    if debug:
         traceback.print_exc()
     print("error:", " ".join(message.split()), file=sys.stderr)
     return EXIT_UNUSABLE

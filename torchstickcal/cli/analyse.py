@@ -19,35 +19,6 @@ if TYPE_CHECKING:
 PICTURES = ("curves.png", "repeated.png")
 
 
-def add_analyse(commands: Any) -> None:
-    command = commands.add_parser(
-        "analyse",
-        help="joint angles, stick kinematics and phases of the swings of a calibrated session",
-        description="Joint angles, stick kinematics, phases and repeated swings of a calibrated session, with their "
-        "standard deviations.",
-    )
-    add = command.add_argument
-    add("calibration", metavar="DIR", type=Path, help=f"folder that `calibrate` wrote, or its {POINTS_FILE}")
-    add("--out", metavar="DIR", type=Path, help="folder for tables and pictures (default: `analysis` in DIR)")
-    add("--sport", default="any", help="golf, baseball, hockey, kendo or any: whose rule for the impact is used (default: any)")
-    add("--fps", metavar="HZ", type=float, help="frames per second (default: the session's)")
-    add(
-        "--up",
-        metavar=("X", "Y", "Z"),
-        nargs=3,
-        type=float,
-        help="the vertical in the frame of the results (default: from the cameras, if they stand level, or from the frame)",
-    )
-    add(
-        "--write",
-        metavar="A,B",
-        help="write the points in these formats too: c3d (with the phases as events), trc, csv, npz",
-    )
-    add("--stick", metavar="N", type=int, default=0, help="which stick, counted from 0 (default: 0)")
-    add("--plugin", action="append", default=[], help=argparse.SUPPRESS)
-    command.set_defaults(run=analyse_session)
-
-
 def analyse_session(options: argparse.Namespace) -> int:
     from torchstickcal.result import Calibration
 

@@ -6,29 +6,36 @@ import argparse
 from pathlib import Path
 from typing import Any, NoReturn
 
-from torchstickcal.cli.analyse import add_analyse
+from torchstickcal.cli.analyse import analyse_session
 from torchstickcal.cli.benchmark import benchmark
 from torchstickcal.cli.calibrate import calibrate_session
 from torchstickcal.cli.calibrate_many import calibrate_sessions
 from torchstickcal.cli.check import check_session
+from torchstickcal.cli.configuration import calibration_config, chosen_config, triangulation_config
 from torchstickcal.cli.convert import convert
-from torchstickcal.cli.detect import add_detect, add_detectors
+from torchstickcal.cli.detect import detect_videos
 from torchstickcal.cli.evaluate import evaluate
 from torchstickcal.cli.info import info
 from torchstickcal.cli.listing import LISTS, list_names
-from torchstickcal.cli.outputs import EXIT_UNUSABLE
+from torchstickcal.cli.outputs import EXIT_DONE, EXIT_UNUSABLE
 from torchstickcal.cli.report import report
 from torchstickcal.cli.sample import sample
 from torchstickcal.cli.simulate import demo, simulate
 from torchstickcal.cli.triangulate import triangulate_session
+from torchstickcal.files import POINTS_FILE
 
 
 class _Parser(argparse.ArgumentParser):
     """A parser whose errors are one line, as those of the commands."""
 
     def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:  # pyright: ignore[reportIncompatibleMethodOverride]
-        """Parse arguments; ``--world points FILE`` is one option with one value."""
-        return super().parse_known_args(None if args is None else _with_files_of_worlds(list(args)), namespace)
+        """Parse arguments; ``--world points FILE`` is one option with one value, and ``--print-config`` needs no others."""
+        if args is not None:
+            args = _with_files_of_worlds(list(args))
+            if "--print-config" in args and "--print-config" in self._option_string_actions:
+                for action in self._actions:
+                    action.required = False
+        return super().parse_known_args(args, namespace)
 
     def error(self, message: str) -> NoReturn:
         self.exit(EXIT_UNUSABLE, f"error: {' '.join(message.split())}; `{self.prog} --help` shows what there is\n")
@@ -55,6 +62,7 @@ def parser() -> argparse.ArgumentParser:
         prog="torchstickcal",
         description="Calibrate a camera rig, in metres, from an athlete's keypoints and a stick of known length.",
     )
+    parser.add_argument("--version", action=_Version, nargs=0, help="show the versions of torchstickcal, torch and Python")
     commands = parser.add_subparsers(metavar="COMMAND", required=True)
     for add in (
         _add_calibrate,
@@ -62,8 +70,8 @@ def parser() -> argparse.ArgumentParser:
         _add_report,
         _add_check,
         _add_triangulate,
-        add_detect,
-        add_analyse,
+        _add_detect,
+        _add_analyse,
         _add_info,
         _add_convert,
         _add_sample,
@@ -74,7 +82,33 @@ def parser() -> argparse.ArgumentParser:
         _add_list,
     ):
         add(commands)
+    _add_common(parser, default=False)
+    for command in commands.choices.values():
+        _add_common(command, default=argparse.SUPPRESS)  # what was said before the command holds
     return parser
+
+
+class _Version(argparse.Action):
+    """Shows the versions, and ends."""
+
+    def __call__(self, parser: argparse.ArgumentParser, *_: Any) -> NoReturn:
+        from torchstickcal.outputs import versions
+
+        found = versions()
+        print(f"torchstickcal {found['torchstickcal']} (torch {found['torch']}, Python {found['python']})")
+        parser.exit(EXIT_DONE)
+
+
+def _add_common(command: argparse.ArgumentParser, default: Any) -> None:
+    """What every command has; it may also be said before the command."""
+    add = command.add_argument
+    add(
+        "--quiet",
+        action="store_true",
+        default=default,
+        help="show nothing but what goes wrong; the exit status says the rest: 0 done, 1 not converged, 2 unusable, 3 poor",
+    )
+    add("--debug", action="store_true", default=default, help="show where in the program an error was raised")
 
 
 def _add_calibrate(commands: Any) -> None:
@@ -98,11 +132,11 @@ def _add_calibrate(commands: Any) -> None:
     command.add_argument(
         "--split-moved", action="store_true", help="if a camera moved, calibrate again with its places before and after as two"
     )
-    add_detectors(command)
+    _add_detectors(command)
     _add_strict(command)
     command.add_argument("--verbose", action="store_true", help="show every table: lenses, clocks, sticks, points, stages")
     _add_plugin(command)
-    command.set_defaults(run=calibrate_session)
+    command.set_defaults(run=calibrate_session, configuration=calibration_config)
 
 
 def _add_report(commands: Any) -> None:
@@ -170,7 +204,7 @@ def _add_calibrate_many(commands: Any) -> None:
     _add_world(command)
     _add_units(command)
     _add_plugin(command)
-    command.set_defaults(run=calibrate_sessions)
+    command.set_defaults(run=calibrate_sessions, configuration=calibration_config)
 
 
 def _add_evaluate(commands: Any) -> None:
@@ -216,7 +250,7 @@ def _add_triangulate(commands: Any) -> None:
     )
     _add_units(command)
     _add_plugin(command)
-    command.set_defaults(run=triangulate_session, intrinsics=None)
+    command.set_defaults(run=triangulate_session, configuration=triangulation_config, intrinsics=None)
 
 
 def _add_info(commands: Any) -> None:
@@ -232,6 +266,66 @@ def _add_info(commands: Any) -> None:
     command.add_argument("--json", metavar="FILE", type=_path, help="write the same as JSON")
     _add_plugin(command)
     command.set_defaults(run=info)
+
+
+def _add_detect(commands: Any) -> None:
+    command = commands.add_parser(
+        "detect",
+        help="find keypoints of the athlete and of the stick in videos",
+        description="Find keypoints of the athlete and of the marked ends of the stick in videos, one for each camera.",
+    )
+    add = command.add_argument
+    add("videos", metavar="VIDEO", type=_path, nargs="+", help="a video for each camera, called after the camera")
+    help = "folder for the keypoints, created if it does not exist; a video that is done is not read again"
+    add("--out", metavar="DIR", type=_path, required=True, help=help)
+    add("--skeleton", metavar="NAME|FILE.toml", help="names of the body's points (default: by their number)")
+    _add_detectors(command)
+    _add_plugin(command)
+    command.set_defaults(run=detect_videos)
+
+
+def _add_detectors(command: argparse.ArgumentParser) -> None:
+    """What is looked for in videos."""
+    add = command.add_argument
+    add("--weights", metavar="FILE.onnx", type=_path, help="videos: network for the body's keypoints, of the kind of RTMPose")
+    add(
+        "--rtmlib",
+        metavar="MODE",
+        choices=("lightweight", "balanced", "performance"),
+        help="videos: use RTMLib with its own weights, which it loads when first used: lightweight, balanced or performance",
+    )
+    add(
+        "--tape",
+        metavar="A,B",
+        help="videos: colours of tape or balls on the stick's ends, the end in the hands first: red, orange, yellow, green, "
+        "cyan, blue, magenta; the cameras must stand still",
+    )
+
+
+def _add_analyse(commands: Any) -> None:
+    command = commands.add_parser(
+        "analyse",
+        help="joint angles, stick kinematics and phases of the swings of a calibrated session",
+        description="Joint angles, stick kinematics, phases and repeated swings of a calibrated session, with their "
+        "standard deviations.",
+    )
+    add = command.add_argument
+    add("calibration", metavar="DIR", type=_path, help=f"folder that `calibrate` wrote, or its {POINTS_FILE}")
+    add("--out", metavar="DIR", type=_path, help="folder for tables and pictures (default: `analysis` in DIR)")
+    add("--sport", default="any", help="golf, baseball, hockey, kendo or any: whose rule for the impact is used (default: any)")
+    add("--fps", metavar="HZ", type=float, help="frames per second (default: the session's)")
+    add(
+        "--up",
+        metavar=("X", "Y", "Z"),
+        nargs=3,
+        type=float,
+        help="the vertical in the frame of the results (default: from the cameras, if they stand level, or from the frame)",
+    )
+    help = "write the points in these formats too: c3d (with the phases as events), trc, csv, npz"
+    add("--write", metavar="A,B", help=help)
+    add("--stick", metavar="N", type=int, default=0, help="which stick, counted from 0 (default: 0)")
+    _add_plugin(command)
+    command.set_defaults(run=analyse_session)
 
 
 def _add_convert(commands: Any) -> None:
@@ -285,8 +379,17 @@ def _add_benchmark(commands: Any) -> None:
         help="with --out: names from `torchstickcal list configs` and `torchstickcal list baselines` (default: all)",
     )
     command.add_argument("--jobs", metavar="N", type=int, default=1, help="with --out: number of processes (default: 1)")
+    command.add_argument(
+        "--external",
+        metavar="NAME=FOLDER",
+        action="append",
+        default=[],
+        help="also measure poses that were computed elsewhere: a folder with a calibration for each session, called after the "
+        "session, of any format; where its unit is not known, its size is fitted to the truth; may be given several times",
+    )
+    _add_units(command)
     _add_plugin(command)
-    command.set_defaults(run=benchmark)
+    command.set_defaults(run=benchmark, configuration=chosen_config)
 
 
 def _add_simulate(commands: Any) -> None:
@@ -357,6 +460,16 @@ def _add_no_sync(command: argparse.ArgumentParser) -> None:
 def _add_config(command: argparse.ArgumentParser) -> None:
     help = "name from `torchstickcal list configs`, or a TOML file (default: default)"
     command.add_argument("--config", metavar="NAME|FILE", default="default", help=help)
+    command.add_argument(
+        "--set",
+        metavar="KEY=VALUE",
+        action="append",
+        default=[],
+        help="set one key of the configuration, as TOML, such as stages.metric.reject_sigmas=5; may be given several times",
+    )
+    command.add_argument(
+        "--print-config", action="store_true", help="show the whole configuration as a file that --config takes, and end"
+    )
 
 
 def _add_format(command: argparse.ArgumentParser, what: str) -> None:
@@ -367,10 +480,10 @@ def _add_format(command: argparse.ArgumentParser, what: str) -> None:
 def _add_write(command: argparse.ArgumentParser, what: str) -> None:
     command.add_argument(
         "--write",
-        "--export",
         metavar="A,B",
         help=f"write {what} in these formats, from `torchstickcal list formats`, or into files whose names say their formats",
     )
+    command.add_argument("--export", dest="write", default=argparse.SUPPRESS, help=argparse.SUPPRESS)  # its earlier name
 
 
 def _add_world(command: argparse.ArgumentParser) -> None:
@@ -434,6 +547,12 @@ def _add_refining(command: argparse.ArgumentParser) -> None:
         "for what the keypoints contradict (default: as in the configuration, else auto)",
     )
     _add_no_sync(command)
+    command.add_argument(
+        "--height",
+        metavar="M",
+        type=float,
+        help="body height of the athlete in metres, which sets the scale, to about 3 %%, where there is no stick",
+    )
     command.add_argument(
         "--stick-length", metavar="M", type=float, help="length of the stick in metres (default: the session's)"
     )

@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import argparse
-import sys
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from torchstickcal.cli.configuration import calibration_config, made_with
+from torchstickcal.cli.console import note
 from torchstickcal.cli.detect import session_in
 from torchstickcal.cli.outputs import chosen_files, show_results
+from torchstickcal.cli.progress import StagesProgress, progress, weights_of
 from torchstickcal.cli.world import placed, world_of
 from torchstickcal.errors import CalibrationError
 
@@ -20,17 +22,15 @@ if TYPE_CHECKING:
     from torchstickcal.observations import Observations
     from torchstickcal.pipeline.calibrate import Callback
     from torchstickcal.result import Calibration
-    from torchstickcal.solvers import IterationRecord
 
 
 def calibrate_session(options: argparse.Namespace) -> int:
-    from torchstickcal.config import load_config
     from torchstickcal.files import atomic_set, try_writing
     from torchstickcal.io import load_session
     from torchstickcal.outputs import check_frame_rate
     from torchstickcal.pipeline.calibrate import calibrate
 
-    config, refine = refining(load_config(options.config), options.refine, options.no_sync)
+    config = calibration_config(options)
     files, world = chosen_files(options.write, rerun=options.rrd), world_of(options.world, options.units)
     initial = initial_of(options.initial)
     try_writing(options.out, files.single_files)
@@ -38,18 +38,23 @@ def calibrate_session(options: argparse.Namespace) -> int:
         try_writing(options.tensorboard, where="--tensorboard")
     given = given_of(options)
     session = load_session(session_in(options.session, options), options.format, given)
-    for note in session.notes:
-        print(f"note: {note}", file=sys.stderr)
+    for sentence in session.notes:
+        note(sentence)
     observations = with_stick(session.observations, options.stick_length, options.stick_sigma)
     check_frame_rate(files.writers, observations)
-    calibration = calibrate(observations, config, Progress(_monitor(options.tensorboard)), refine, initial=initial)
-    if options.split_moved and (split := _split(observations, calibration)) is not None:
-        calibration = calibrate(split, config, Progress(_monitor(options.tensorboard)), refine)
-    calibration, sentences = placed(calibration, world)
-    for sentence in sentences:
-        print(f"note: {sentence}", file=sys.stderr)
-    with atomic_set(options.out) as folder:
-        files(calibration, folder, _provenance(options, config, [*session.notes, *sentences]))
+    with progress(options) as bar:
+
+        def listener() -> Callback:
+            return StagesProgress(bar, weights_of(config), _monitor(options.tensorboard))
+
+        calibration = calibrate(observations, config, listener(), initial=initial)
+        if options.split_moved and (split := _split(observations, calibration)) is not None:
+            calibration = calibrate(split, config, listener())
+        calibration, sentences = placed(calibration, world)
+        with atomic_set(options.out) as folder:
+            files(calibration, folder, _provenance(options, config, [*session.notes, *sentences]))
+    for sentence in [*sentences, *(f.meaning for f in calibration.quality.findings if f.code == "height_unused")]:
+        note(sentence)
     return show_results(calibration, options.out, files, options.strict, options.verbose)
 
 
@@ -111,35 +116,10 @@ def _provenance(options: argparse.Namespace, config: Config, notes: Sequence[str
 
     return {
         "session": ", ".join(map(str, options.session)),
-        "config": options.config,
+        **made_with(options.config, options.set),
         "configuration": asdict(config),
         **({"notes": list(notes)} if notes else {}),
     }
-
-
-def refining(config: Config, option: str | None, no_sync: bool) -> tuple[Config, Any]:
-    """The configuration, and what to refine instead of what it says; None to do as it says.
-
-    Raises:
-        CalibrationError: for an unknown name, or if clocks are to be refined despite ``--no-sync``.
-    """
-    from torchstickcal.model.unknowns import REFINEMENTS, clock_refinements
-
-    refine: Any = option
-    if option is None:
-        refine = None if config.refine else "auto"
-    elif option != "auto":
-        refine = [] if option == "none" else option.split(",")
-        for name in refine:
-            REFINEMENTS[name]  # raises for an unknown name
-    if no_sync and refine is not None and clock_refinements() & set(refine):
-        raise CalibrationError(
-            "clocks cannot be refined if the cameras are synchronised",
-            where="--no-sync",
-            got=f"--refine {option}",
-            expected="one of the two",
-        )
-    return (replace(config, synchronise=False) if no_sync else config), refine
 
 
 def with_stick(observations: Observations, length_m: float | None, sigma_m: float | None) -> Observations:
@@ -168,28 +148,3 @@ def _monitor(log_dir: Path | None) -> Callback | None:
     from torchstickcal.show.tensorboard import TensorBoardMonitor
 
     return TensorBoardMonitor(log_dir)
-
-
-class Progress:
-    """Shows the iterations on the last line of a terminal, and passes all calls on to another callback."""
-
-    def __init__(self, following: Callback | None) -> None:
-        self._following = following
-        self._live = sys.stderr.isatty()
-
-    def on_start(self, observations: Observations) -> None:
-        if (on_start := getattr(self._following, "on_start", None)) is not None:
-            on_start(observations)
-
-    def on_iteration(self, record: IterationRecord) -> None:
-        if self._live:
-            line = f"{record.stage}: iteration {record.iteration}, cost {record.cost:.6g}"
-            print(f"\r{line:<70}", end="", file=sys.stderr, flush=True)
-        if self._following:
-            self._following.on_iteration(record)
-
-    def on_end(self, calibration: Calibration) -> None:
-        if self._live:
-            print(f"\r{'':<70}\r", end="", file=sys.stderr, flush=True)
-        if self._following:
-            self._following.on_end(calibration)

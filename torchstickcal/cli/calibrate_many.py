@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 import re
 import sys
-import time
 from contextlib import nullcontext
 from dataclasses import dataclass, replace
 from functools import partial
@@ -13,9 +12,11 @@ from pathlib import Path
 from textwrap import shorten
 from typing import TYPE_CHECKING, Any
 
-from torchstickcal.cli.calibrate import given_of, refining, with_stick
+from torchstickcal.cli.calibrate import given_of, with_stick
+from torchstickcal.cli.configuration import calibration_config, made_with
 from torchstickcal.cli.outputs import EXIT_DONE, EXIT_NOT_CONVERGED, chosen_files
 from torchstickcal.cli.plugins import import_plugins
+from torchstickcal.cli.progress import Progress, progress
 from torchstickcal.cli.world import placed, world_of
 from torchstickcal.errors import CalibrationError
 
@@ -31,17 +32,16 @@ _SHOWN_FAILURES, _LONGEST_ERROR = 5, 250
 
 
 def calibrate_sessions(options: argparse.Namespace) -> int:
-    from torchstickcal.config import load_config
     from torchstickcal.many import calibrate_many, session_files
     from torchstickcal.many.cluster import cluster_executor
     from torchstickcal.many.manifest import CONVERGED, FAILED
     from torchstickcal.many.tables import INDEX_FILE
 
-    config, refine = refining(load_config(options.config), options.refine, options.no_sync)
+    config = calibration_config(options)
     memory_bytes, shard = _bytes(options.memory), _shard(options.shard)
     world_of(options.world, options.units)
     files = chosen_files(options.write, options.page, options.rrd)
-    writing = _Writing(options.config, files, _with_whole_path(options.world), options.units)
+    writing = _Writing(options.config, files, _with_whole_path(options.world), options.units, tuple(options.set))
     given = given_of(options)
     for name in ("intrinsics", "skeleton"):  # files, which processes elsewhere must find too
         file = getattr(given, name)
@@ -50,20 +50,19 @@ def calibrate_sessions(options: argparse.Namespace) -> int:
     stick = _Stick(options.stick_length, options.stick_sigma)
     sessions = session_files(options.sessions, options.format, given, None if stick == _Stick() else stick)
     plugins = [str(Path(plugin).absolute()) if plugin.endswith(".py") else plugin for plugin in options.plugin]
-    with cluster_executor(options.cluster) if options.cluster else nullcontext() as executor:
+    with cluster_executor(options.cluster) if options.cluster else nullcontext() as executor, progress(options) as bar:
         done = calibrate_many(
             sessions,
             config,
-            refine,
-            executor,
-            options.out,
+            executor=executor,
+            out=options.out,
             jobs=options.jobs,
             memory_bytes=memory_bytes,
             shard=shard,
             retry=options.retry,
             write=writing,
             prepare=partial(import_plugins, plugins),
-            progress=_Progress(),
+            progress=_Failures(bar),
         )
     failed = [row for row in done.rows if row.outcome == FAILED]
     converged = sum(row.outcome == CONVERGED for row in done.rows)
@@ -73,6 +72,17 @@ def calibrate_sessions(options: argparse.Namespace) -> int:
         print(f"failed: {len(failed) - _SHOWN_FAILURES} more; {options.out / INDEX_FILE} says why", file=sys.stderr)
     print(f"{converged} of {len(done.rows)} converged, {len(failed)} failed; {options.out / INDEX_FILE} shows all")
     return EXIT_DONE if converged == len(done.rows) else EXIT_NOT_CONVERGED
+
+
+class _Failures:
+    """Shows on a bar how many sessions are done, and how many of them failed."""
+
+    def __init__(self, bar: Progress) -> None:
+        self._bar, self._failed = bar, 0
+
+    def __call__(self, done: int, total: int | None, row: SessionRow) -> None:
+        self._failed += row.error is not None
+        self._bar(done, total or 0, f"session {done} of {total}, {self._failed} failed: {row.name}")
 
 
 @dataclass(frozen=True)
@@ -94,10 +104,11 @@ class _Writing:
     files: ResultFiles
     world: str
     units: str | None
+    set: tuple[str, ...] = ()
 
     def __call__(self, calibration: Calibration, folder: Path, provenance: dict[str, Any]) -> None:
         calibration, sentences = placed(calibration, world_of(self.world, self.units))
-        provenance = provenance | {"config": self.config}
+        provenance = provenance | made_with(self.config, self.set)
         if notes := [*provenance.get("notes", ()), *sentences]:
             provenance["notes"] = notes
         self.files(calibration, folder, provenance)
@@ -135,33 +146,3 @@ def _shard(text: str | None) -> tuple[int, int] | None:
     if shard is None:
         raise CalibrationError("not a shard", where="--shard", got=repr(text), expected="i/n with i from 1 to n, such as 1/4")
     return int(shard[1]), int(shard[2])
-
-
-class _Progress:
-    """One bar in a terminal, with the failures so far and the time that is left; silent elsewhere."""
-
-    def __init__(self) -> None:
-        self._live = sys.stderr.isatty()
-        self._began, self._first, self._failed = time.monotonic(), 0, 0
-
-    def __call__(self, done: int, total: int | None, row: SessionRow) -> None:
-        self._first = self._first or done
-        self._failed += row.error is not None
-        if not self._live or total is None:
-            return
-        pace = (time.monotonic() - self._began) / (done - self._first + 1)
-        bar, left = "#" * (30 * done // total), _duration(pace * (total - done))
-        line = f"[{bar:<30}] {done}/{total}, {self._failed} failed, {left} left: {row.name}"
-        print(f"\r{line:<100.100}", end="\n" if done == total else "", file=sys.stderr, flush=True)
-
-
-def _duration(seconds: float) -> str:
-    """A time as people say it.
-
-    Example:
-        >>> _duration(12), _duration(200), _duration(5000)
-        ('12 s', '3 min', '1.4 h')
-    """
-    if seconds < 100:
-        return f"{seconds:.0f} s"
-    return f"{seconds / 60:.0f} min" if seconds < 3600 else f"{seconds / 3600:.1f} h"

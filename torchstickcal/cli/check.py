@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import argparse
-import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from torchstickcal.cli.calibrate import given_of
+from torchstickcal.cli.console import note
 from torchstickcal.cli.evaluate import poses_of
 from torchstickcal.cli.outputs import exit_status, show_quality, try_json, write_json
 from torchstickcal.files import POINTS_FILE
@@ -24,8 +24,8 @@ def check_session(options: argparse.Namespace) -> int:
     try_json(options.json)
     names, old = _old_rig(options.calibration, options.units)
     session = load_session(options.session, options.format, given_of(options))
-    for note in session.notes:
-        print(f"note: {note}", file=sys.stderr)
+    for sentence in session.notes:
+        note(sentence)
     observations = session.observations
     labels = observations.camera_labels
     if names != labels and set(names) == set(labels):

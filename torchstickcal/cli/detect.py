@@ -3,53 +3,14 @@
 from __future__ import annotations
 
 import argparse
-import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
 
+from torchstickcal.cli.console import note
 from torchstickcal.cli.outputs import EXIT_DONE
+from torchstickcal.cli.progress import Progress, progress
 
 VIDEO_SUFFIXES = (".avi", ".m4v", ".mkv", ".mov", ".mp4", ".mpg", ".mpeg", ".mts", ".webm", ".wmv")
-
-
-def add_detect(commands: Any) -> None:
-    command = commands.add_parser(
-        "detect",
-        help="find keypoints of the athlete and of the stick in videos",
-        description="Find keypoints of the athlete and of the marked ends of the stick in videos, one for each camera.",
-    )
-    add = command.add_argument
-    add("videos", metavar="VIDEO", type=Path, nargs="+", help="a video for each camera, called after the camera")
-    add(
-        "--out",
-        metavar="DIR",
-        type=Path,
-        required=True,
-        help="folder for the keypoints; a video that is done is not read again",
-    )
-    add("--skeleton", metavar="NAME|FILE.toml", help="names of the body's points (default: by their number)")
-    add_detectors(command)
-    add("--plugin", action="append", default=[], help=argparse.SUPPRESS)
-    command.set_defaults(run=detect_videos)
-
-
-def add_detectors(command: argparse.ArgumentParser) -> None:
-    """What is looked for in videos."""
-    add = command.add_argument
-    add("--weights", metavar="FILE.onnx", type=Path, help="videos: network for the body's keypoints, of the kind of RTMPose")
-    add(
-        "--rtmlib",
-        metavar="MODE",
-        choices=("lightweight", "balanced", "performance"),
-        help="videos: use RTMLib with its own weights, which it loads when first used: lightweight, balanced or performance",
-    )
-    add(
-        "--tape",
-        metavar="A,B",
-        help="videos: colours of tape or balls on the stick's ends, the end in the hands first: red, orange, yellow, green, "
-        "cyan, blue, magenta; the cameras must stand still",
-    )
 
 
 def detect_videos(options: argparse.Namespace) -> int:
@@ -80,8 +41,8 @@ def session_in(paths: Sequence[Path], options: argparse.Namespace) -> Sequence[P
             remedy=f"Leave {' and '.join(asked)} out to calibrate keypoints." if asked else "Give videos alone.",
         )  # fmt: skip
     folder = options.out.with_name(f"{options.out.resolve().name}-keypoints")
-    for note in found_in_videos(videos, folder, options):
-        print(f"note: {note}", file=sys.stderr)
+    for sentence in found_in_videos(videos, folder, options):
+        note(sentence)
     return [folder]
 
 
@@ -102,16 +63,16 @@ def found_in_videos(videos: Sequence[Path], folder: Path, options: argparse.Name
     tapes = [name.strip().lower() for name in options.tape.split(",")] if options.tape else []
     try_writing(folder, ["keypoints.csv", "videos.json"])
     settings = {"weights": None if options.weights is None else str(options.weights), "rtmlib": options.rtmlib}
-    return detect(videos, folder, make_body, tapes, options.skeleton, _progress(), settings)
+    with progress(options) as bar:
+        shown = _shown(bar, [path.stem for path in videos])
+        return detect(videos, folder, make_body, tapes, options.skeleton, shown, settings)
 
 
-def _progress() -> Any:
-    """Shows the frames on the last line of a terminal."""
-    if not sys.stderr.isatty():
-        return None
+def _shown(bar: Progress, cameras: list[str]) -> Callable[[str, int, int], None]:
+    """Shows on a bar how far the videos of some cameras are read."""
 
     def show(camera: str, done: int, frames: int) -> None:
-        end = "\n" if done == frames else ""
-        print(f"\r{camera}: frame {done}{f' of {frames}' if frames else ''}", end=end, file=sys.stderr, flush=True)
+        share = min(done / frames, 1.0) if frames else 0.0
+        bar(cameras.index(camera) + share, len(cameras), f"{camera}: frame {done}{f' of {frames}' if frames else ''}")
 
     return show

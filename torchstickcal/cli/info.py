@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 import argparse
-import sys
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 from torchstickcal.cli.calibrate import given_of
+from torchstickcal.cli.console import note
 from torchstickcal.cli.outputs import EXIT_DONE, try_json, write_json
+from torchstickcal.errors import CalibrationError
 
 if TYPE_CHECKING:
     from torchstickcal.observations import Observations
 
+_TRIED = 60
+"""Frames by which the accuracy is estimated."""
 _FEW = 20
 """Keypoints that two cameras must have in common to be placed by them."""
 
@@ -23,9 +26,9 @@ def info(options: argparse.Namespace) -> int:
     try_json(options.json)
     given = given_of(options)
     session = load_session(options.session, options.format, replace(given, stick=given.stick or []))
-    for note in session.notes:
-        print(f"note: {note}", file=sys.stderr)
-    found = _found(session.observations)
+    for sentence in session.notes:
+        note(sentence)
+    found = _found(session.observations) | {"expected": _expected(session.observations)}
     print(_table(found))
     write_json(options.json, found | {"notes": list(session.notes)})
     return EXIT_DONE
@@ -64,6 +67,32 @@ def _found(observations: Observations) -> dict[str, Any]:
     }
 
 
+def _expected(observations: Observations) -> dict[str, Any]:
+    """How exact a calibration becomes, by one of some frames; as JSON can hold it."""
+    import torch
+
+    from torchstickcal.pipeline.calibrate import calibrate
+
+    if not observations.sticks:
+        return {"unknown": "no stick is given (--stick)"}
+    if observations.timestamps is not None:
+        return {"unknown": "the cameras have times of their own"}
+    frames = torch.linspace(0, observations.num_frames - 1, min(_TRIED, observations.num_frames)).round().long()
+    confidence = observations.confidence
+    part = replace(
+        observations,
+        keypoints=observations.keypoints[:, frames],
+        confidence=None if confidence is None else confidence[:, frames],
+        fps=None,
+    )
+    try:
+        calibration = calibrate(part, refine=())
+    except CalibrationError as error:
+        return {"unknown": f"{error.what}: {error.got}"}
+    std_m = float(calibration.camera_std_m[1:].mean())
+    return {"frames": len(frames), "position_std_m": std_m, "verdict": calibration.quality.verdict.value}
+
+
 def _table(found: dict[str, Any]) -> str:
     """The same as a text to print."""
     from torchstickcal.show.tables import printable, text_table
@@ -89,4 +118,15 @@ def _table(found: dict[str, Any]) -> str:
     for stick in found["sticks"]:
         ends = f"{printable(stick['start'])} - {printable(stick['end'])}"
         text.append(f"Stick {ends}, {stick['length_m']:g} m: both ends are seen by two cameras in {stick['frames']} frames.")
+    text.append(f"Expected accuracy: {_expectation(found['expected'], found['frames'])}")
     return "\n".join(text)
+
+
+def _expectation(expected: dict[str, Any], frames: int) -> str:
+    if "unknown" in expected:
+        return f"not known, because {expected['unknown']}."
+    if expected["verdict"] not in ("good", "usable"):
+        return f"{expected['verdict']}, by {expected['frames']} of {frames} frames; `torchstickcal calibrate` says why."
+    figure = f"standard deviation of the camera positions {1000 * expected['position_std_m']:.2g} mm"
+    more = "; all frames together do better" if expected["frames"] < frames else ""
+    return f"{figure}, by {expected['frames']} of {frames} frames{more}."

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from torchstickcal import files as written
-from torchstickcal.cli.console import print_coloured
+from torchstickcal.cli.console import is_quiet, print_coloured
 from torchstickcal.errors import CalibrationError
 from torchstickcal.files import PAGE_FILE, REPORT_FILE
 
@@ -95,11 +95,15 @@ def show_quality(quality: Quality, notes: bool = False) -> None:
 
 
 def exit_status(quality: Quality, strict: bool) -> int:
-    """0 for good and usable, 3 for poor and failed; where it is strict, also for usable."""
+    """0 for good and usable, 3 for poor and failed; where it is strict, also for usable. With ``--quiet`` 3 has its reason."""
     from torchstickcal.quality.verdict import Verdict
+    from torchstickcal.show.quality import meaning_of
 
-    accepted = (Verdict.GOOD,) if strict else (Verdict.GOOD, Verdict.USABLE)
-    return EXIT_DONE if quality.verdict in accepted else EXIT_POOR
+    if quality.verdict in ((Verdict.GOOD,) if strict else (Verdict.GOOD, Verdict.USABLE)):
+        return EXIT_DONE
+    if is_quiet():
+        print(f"verdict: {quality.verdict.value} ({meaning_of(quality.verdict)})", file=sys.stderr)
+    return EXIT_POOR
 
 
 def errors_by_camera(names: Sequence[str], errors: PoseErrors) -> dict[str, Any]:

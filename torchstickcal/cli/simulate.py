@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import argparse
-import sys
 
-from torchstickcal.cli.calibrate import Progress
 from torchstickcal.cli.outputs import (
     EXIT_DONE,
     chosen_files,
@@ -13,6 +11,7 @@ from torchstickcal.cli.outputs import (
     print_errors,
     show_results,
 )
+from torchstickcal.cli.progress import StagesProgress, progress, weights_of
 from torchstickcal.cli.world import placed, world_of
 
 
@@ -23,20 +22,20 @@ def simulate(options: argparse.Namespace) -> int:
 
     specs = session_specs(options.name, options.count, options.seed)
     try_writing(options.out, [f"{specs[0].name}.npz"])
-    width = max(len(spec.name) for spec in specs)
-    for number, spec in enumerate(specs, 1):
-        end = "\r" if sys.stderr.isatty() and number < len(specs) else "\n"
-        print(f"{number}/{len(specs)} {spec.name:{width}}", end=end, file=sys.stderr, flush=True)
-        session = spec.generate()
-        with atomic_set(options.out) as folder:
-            write_simulated(folder / f"{spec.name}.npz", session)
-            if options.gif:
-                write_film(folder / f"{spec.name}.gif", session)
+    with progress(options) as bar:
+        for number, spec in enumerate(specs):
+            bar(number, len(specs), f"session {number + 1} of {len(specs)}: {spec.name}")
+            session = spec.generate()
+            with atomic_set(options.out) as folder:
+                write_simulated(folder / f"{spec.name}.npz", session)
+                if options.gif:
+                    write_film(folder / f"{spec.name}.gif", session)
     print(f"{len(specs)} session{'s' if len(specs) > 1 else ''} in {options.out}")
     return EXIT_DONE
 
 
 def demo(options: argparse.Namespace) -> int:
+    from torchstickcal.config import load_config
     from torchstickcal.files import atomic_set, try_writing
     from torchstickcal.io import write_npz
     from torchstickcal.metrics import pose_errors
@@ -50,7 +49,9 @@ def demo(options: argparse.Namespace) -> int:
         "A golf swing seen by 6 cameras: 240 frames, 1.5 px noise, 15 % of the keypoints missing, 5 % wrong by up to 150 px.\n"
     )
     observations, truth = golf_session(noise=Noise(sigma_px=1.5, missing=0.15, outliers=0.05), seed=options.seed)
-    calibration, _ = placed(calibrate(observations, callback=Progress(None)), world_of("athlete"))
+    with progress(options) as bar:
+        calibration = calibrate(observations, callback=StagesProgress(bar, weights_of(load_config())))
+    calibration, _ = placed(calibration, world_of("athlete"))
     with atomic_set(options.out) as folder:
         write_npz(folder / "session.npz", observations, truth)
         files(calibration, folder, {"session": str(options.out / "session.npz"), "config": "default"})

@@ -3,18 +3,22 @@
 from __future__ import annotations
 
 import argparse
-import sys
 from dataclasses import replace
 from typing import Any
 
 from torchstickcal.cli.analyse import write_analysis
 from torchstickcal.cli.calibrate import given_of
+from torchstickcal.cli.configuration import made_with, triangulation_config
+from torchstickcal.cli.console import note
 from torchstickcal.cli.outputs import EXIT_DONE, point_writers, write_json
+from torchstickcal.cli.progress import StagesProgress, progress
 from torchstickcal.files import REPORT_FILE
+
+_STAGES = {"points": 1.0, "trajectories": 2.0}
+"""The stages, and how long each of them takes in comparison with the other."""
 
 
 def triangulate_session(options: argparse.Namespace) -> int:
-    from torchstickcal.config import load_config
     from torchstickcal.files import atomic_set, try_writing
     from torchstickcal.io import Motion, Rig, load_session
     from torchstickcal.io.results import read_result
@@ -22,8 +26,7 @@ def triangulate_session(options: argparse.Namespace) -> int:
     from torchstickcal.pipeline.triangulate import triangulate
     from torchstickcal.show.reconstruction import summary, table
 
-    config = load_config(options.config)
-    config = replace(config, synchronise=False) if options.no_sync else config
+    config = triangulation_config(options)
     writers = point_writers(options.write)
     try_writing(options.out, [*writers, REPORT_FILE])
     calibration = read_result(options.calibration)
@@ -33,10 +36,12 @@ def triangulate_session(options: argparse.Namespace) -> int:
     given = given_of(options)
     given = replace(given, intrinsics=rig, stick=given.stick or [])
     session = load_session(options.session, options.format, given)
-    for note in session.notes:
-        print(f"note: {note}", file=sys.stderr)
+    for sentence in session.notes:
+        note(sentence)
     check_frame_rate(writers, session.observations)
-    found = triangulate(session.observations, calibration, config, turned=options.turned)
+    with progress(options) as bar:
+        listener = StagesProgress(bar, _STAGES).on_iteration
+        found = triangulate(session.observations, calibration, config, turned=options.turned, listener=listener)
     with atomic_set(options.out) as folder:
         for name, writer in writers.items():
             writer.write(folder / name, Motion.of(found))
@@ -53,6 +58,6 @@ def _provenance(options: argparse.Namespace, notes: list[str]) -> dict[str, Any]
     return {
         "session": ", ".join(map(str, options.session)),
         "calibration": str(options.calibration),
-        "config": options.config,
+        **made_with(options.config, options.set),
         **({"notes": notes} if notes else {}),
     }

@@ -8,8 +8,9 @@ from typing import Any
 
 import numpy as np
 
+from torchstickcal.files import toml_string
 from torchstickcal.io.about import about
-from torchstickcal.io.camera_toml import camera_table, quoted, write_tables
+from torchstickcal.io.camera_toml import camera_table, write_tables
 from torchstickcal.io.formats import calibration_reader, camera_writer, keypoint_reader, reading
 from torchstickcal.io.recording import Detection, Recording, View, last_number
 from torchstickcal.io.rig import Rig, RigCamera
@@ -71,7 +72,7 @@ def write_caliscope(path: Path, rig: Rig) -> None:
         table |= {"cam_id": number, "size": list(map(round, rig.size(camera))), "rotation_count": 0}
         table |= {"distortions": rig.coefficients(camera, 5, 5, "Caliscope"), "fisheye": str(rig.fisheye[camera]).lower()}
         tables.append((f"cameras.{number}", table))
-    metadata = {key: quoted(text) for key, text in about("metres", rig.world).items()}
+    metadata = {key: toml_string(text) for key, text in about("metres", rig.world).items()}
     write_tables(path, tables, metadata)
 
 

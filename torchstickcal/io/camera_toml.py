@@ -7,7 +7,6 @@ of FreeMoCap, and a unit that the file does not say in those of aniposelib. Both
 
 from __future__ import annotations
 
-import json
 import math
 import re
 from collections.abc import Mapping, Sequence
@@ -17,7 +16,7 @@ from typing import Any, TypeVar
 import cv2
 from torch import Tensor
 
-from torchstickcal.files import atomic_path, check_text
+from torchstickcal.files import atomic_path, check_text, toml_string
 from torchstickcal.io.about import about
 from torchstickcal.io.formats import calibration_reader, camera_writer, reading
 from torchstickcal.io.rig import METRES, Rig, RigCamera, as_float64
@@ -92,13 +91,13 @@ def write_freemocap(path: Path, rig: Rig) -> None:
     for camera, name in enumerate(rig.names):
         centre = -rotations[camera].mT @ translations[camera] / METRES["mm"]
         table = camera_table(rig, camera, "mm") | {
-            "id": quoted(name),
+            "id": toml_string(name),
             "index": camera,
             "distortions": rig.coefficients(camera, 5, 5, "FreeMoCap"),
             "world_orientation": rotations[camera].mT.tolist(),
             "world_position": centre.tolist(),
         }
-        tables.append((quoted(name), table))
+        tables.append((toml_string(name), table))
     more = {"reprojection_error_px": _number(rig.error_px)}
     write_tables(path, tables, more | _about("mm", "millimetres", rig))
 
@@ -128,7 +127,7 @@ def table_names(rig: Rig) -> list[str]:
 def camera_table(rig: Rig, camera: int, unit: str = "m") -> dict[str, object]:
     """What the files of all these programs say of a camera, as TOML writes it. No pose where none is known."""
     table: dict[str, object] = {
-        "name": quoted(rig.names[camera]),
+        "name": toml_string(rig.names[camera]),
         "size": rig.size(camera),
         "matrix": rig.intrinsics[camera].tolist(),
         "distortions": rig.coefficients(camera, 5, _MOST_COEFFICIENTS, "calibration"),
@@ -218,8 +217,8 @@ def _unit(cameras: dict[str, Any], metadata: dict[str, Any]) -> str | None:
 
 
 def _about(unit: str, words: str, rig: Rig) -> dict[str, str]:
-    said = {key: quoted(text) for key, text in about(words, rig.world).items()}
-    return said | {"units": quoted(unit)}
+    said = {key: toml_string(text) for key, text in about(words, rig.world).items()}
+    return said | {"units": toml_string(unit)}
 
 
 def _number(value: float | None) -> float:
@@ -232,8 +231,3 @@ def _given(camera: dict[str, Any], key: str, kind: type[_Value], default: _Value
     if not isinstance(value, kind):
         raise TypeError(f"{key} is a {type(value).__name__} where a {kind.__name__} is expected")
     return value
-
-
-def quoted(name: str) -> str:
-    """A text as TOML: JSON, with the one character escaped that JSON allows and TOML does not."""
-    return json.dumps(name, ensure_ascii=False).replace("\x7f", "\\u007f")

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from torchstickcal.archives import save_arrays
 from torchstickcal.files import atomic_path
 from torchstickcal.io.formats import reading, session_of, session_reader
 from torchstickcal.io.truth import Truth
@@ -115,7 +116,7 @@ def write_npz(
     """
     arrays = _arrays(observations) | _truth_arrays(truth) | dict(more or {})
     with atomic_path(path) as temporary, temporary.open("wb") as file:
-        np.savez_compressed(file, **arrays)
+        save_arrays(file, arrays)
 
 
 def _observations(arrays: Mapping[str, Any]) -> Observations:

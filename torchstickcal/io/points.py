@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from torchstickcal.archives import save_arrays
 from torchstickcal.errors import CalibrationError
 from torchstickcal.files import atomic_path, check_text
 from torchstickcal.io.about import about, comments
@@ -126,7 +127,7 @@ def write_point_arrays(path: Path, motion: Motion) -> None:
     if motion.times is not None:
         arrays["times_s"] = motion.times
     with atomic_path(path) as temporary, temporary.open("wb") as file:
-        np.savez_compressed(file, **arrays)
+        save_arrays(file, arrays)
 
 
 def _word(name: str) -> str:

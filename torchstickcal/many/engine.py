@@ -1,42 +1,60 @@
-"""Tasks on an executor: a bounded number at a time, and no task is lost with the process that had it."""
+"""Tasks on an executor: a bounded number at a time, small ones in groups, and none is lost with the process that had it."""
 
 from __future__ import annotations
 
 import itertools
-from collections import Counter
-from collections.abc import Callable, Generator, Iterator
+from collections import Counter, deque
+from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, CancelledError, Executor, Future, wait
 from functools import partial
 from typing import Any
 
 from torchstickcal.errors import CalibrationError
-from torchstickcal.many.manifest import SessionRow
 from torchstickcal.many.memory import Budget, memory_for_sessions
-from torchstickcal.many.task import Task, error_text, failed_row, perform, use_budget
+from torchstickcal.many.task import Done, Performed, Task, error_text, failed_row, perform, use_budget
 from torchstickcal.processes import WorkerProcesses
-from torchstickcal.result import Calibration
 
-Done = tuple[SessionRow, Calibration | None]
+Group = tuple[Task, ...]
 Submit = Callable[..., Future[Any]]
 
 _ON_EXECUTORS = 256
-"""Tasks that are given at a time to an executor whose size is not known."""
+"""Groups of tasks that are given at a time to an executor whose size is not known."""
+_MOST_TOGETHER = 8
+"""Tasks of a group: what is lost if its process is killed, and what is worth calibrating side by side."""
 _CARRIED_BYTES = 500_000_000
 """Size of the observations that are on their way at a time, where sessions are given as observations."""
 _MOST_DEATHS = 3
 """Processes that a session may take with it before it has failed, and attempts to start processes."""
 
 
-def on_executor(tasks: Iterator[Task], executor: Executor) -> Generator[Done]:
+class _Queue:
+    """Tasks in groups: one by one, until it is known how many such sessions are worth calibrating together."""
+
+    def __init__(self, tasks: Iterable[Task], together: int = 1) -> None:
+        self._tasks, self._returned, self._together = iter(tasks), deque[Task](), together
+
+    def next_group(self) -> Group:
+        """The next tasks; none at the end."""
+        group = [self._returned.popleft() for _ in range(min(self._together, len(self._returned)))]
+        return (*group, *itertools.islice(self._tasks, self._together - len(group)))
+
+    def learn(self, group: Group, performed: Performed) -> None:
+        """Take back what was not done of a group, and note how many of its sessions are worth calibrating together."""
+        self._returned.extend(group[len(performed.done) :])
+        if performed.together is not None:
+            self._together = min(performed.together, _MOST_TOGETHER)
+
+
+def on_executor(tasks: Iterator[Task], executor: Executor) -> Generator[list[Done]]:
     """Perform tasks on any executor; what is done comes as it is ready.
 
     Raises:
         CalibrationError: if the executor is broken, after everything that it has done.
     """
     lost = 0
-    for _, done in _flight(tasks, executor.submit, _ON_EXECUTORS):
+    for group, done in _flight(_Queue(tasks), executor.submit, _ON_EXECUTORS):
         if done is None:
-            lost += 1
+            lost += len(group)
         else:
             yield done
     if lost:
@@ -51,11 +69,11 @@ def on_executor(tasks: Iterator[Task], executor: Executor) -> Generator[Done]:
 
 def on_processes(
     tasks: Iterator[Task], count: int, memory_bytes: int | None, prepare: Callable[[], object] | None
-) -> Generator[Done]:
+) -> Generator[list[Done]]:
     """Perform tasks in processes of this machine; what is done comes as it is ready.
 
-    Where a process is killed, the sessions in hand are calibrated again one by one, in new processes. A session whose process
-    is killed every time has failed.
+    Where a process is killed, the groups in hand are calibrated again one by one, in new processes, and if that kills one too,
+    its sessions one by one. A session whose process is killed every time has failed.
 
     Args:
         tasks: what is to be done.
@@ -70,31 +88,32 @@ def on_processes(
     first = next(tasks, None)
     if first is None:
         return
-    tasks = itertools.chain([first], tasks)
-    lost: list[Task] = []
+    queue = _Queue(itertools.chain([first], tasks))
+    lost: list[Group] = []
     deaths: Counter[str] = Counter()
     while True:
         with _started(count, share, prepare) as processes:
             again, lost = lost, []
             while again and not lost:
-                for task, done in _flight(iter([again.pop(0)]), processes.submit, 1):
+                alone = again.pop(0)
+                for group, done in _flight(_Queue(alone, len(alone)), processes.submit, 1):
                     if done is None:
-                        lost.append(task)
-                    else:
-                        yield done
-            lost += again
-            if not lost:
-                for task, done in _flight(tasks, processes.submit, 2 * count):
-                    if done is None:
-                        lost.append(task)
+                        lost += [(task,) for task in group]
                     else:
                         yield done
             if not lost:
+                for group, done in _flight(queue, processes.submit, 2 * count):
+                    if done is None:
+                        lost.append(group)
+                    else:
+                        yield done
+            if not lost and not again:
                 return
-        deaths.update(task.source.name for task in lost if task not in again)
-        for task in [task for task in lost if deaths[task.source.name] >= _MOST_DEATHS]:
-            lost.remove(task)
-            yield failed_row(task, _KILLED), None
+        deaths.update(task.source.name for group in lost for task in group)
+        for group in [group for group in lost if deaths[group[0].source.name] >= _MOST_DEATHS]:
+            lost.remove(group)
+            yield [(failed_row(task, _KILLED), None) for task in group]
+        lost += again
 
 
 _KILLED = (
@@ -129,34 +148,38 @@ def _started(count: int, memory_bytes: int | None, prepare: Callable[[], object]
     )
 
 
-def _flight(tasks: Iterator[Task], submit: Submit, most: int) -> Iterator[tuple[Task, Done | None]]:
-    """Tasks as they end, with None for those that were lost with a process; after a loss no further task is begun."""
-    flying: dict[Future[Done], Task] = {}
+def _flight(queue: _Queue, submit: Submit, most: int) -> Iterator[tuple[Group, list[Done] | None]]:
+    """Groups as they end, with None for those that were lost with a process; after a loss no further group is begun."""
+    flying: dict[Future[Performed], Group] = {}
     broken = False
     while True:
         while not broken and len(flying) < most and _carried_bytes(flying) <= _CARRIED_BYTES:
-            task = next(tasks, None)
-            if task is None:
+            group = queue.next_group()
+            if not group:
                 break
             try:
-                flying[submit(perform, task)] = task
+                flying[submit(perform, group)] = group
             except RuntimeError:  # the executor is broken, or has been shut down
                 broken = True
-                yield task, None
+                yield group, None
         if not flying:
             return
         for future in wait(flying, return_when=FIRST_COMPLETED).done:
-            task = flying.pop(future)
-            done = _done(task, future)
-            broken = broken or done is None
-            yield task, done
+            group = flying.pop(future)
+            performed = _performed(group, future)
+            if performed is None:
+                broken = True
+                yield group, None
+            else:
+                queue.learn(group, performed)
+                yield group, performed.done
 
 
-def _carried_bytes(flying: dict[Future[Done], Task]) -> int:
-    return sum(task.source.carried_bytes for task in flying.values())
+def _carried_bytes(flying: dict[Future[Performed], Group]) -> int:
+    return sum(task.source.carried_bytes for group in flying.values() for task in group)
 
 
-def _done(task: Task, future: Future[Done]) -> Done | None:
+def _performed(group: Sequence[Task], future: Future[Performed]) -> Performed | None:
     """What a future has given; None where its process ended first."""
     try:
         return future.result()
@@ -164,5 +187,7 @@ def _done(task: Task, future: Future[Done]) -> Done | None:
         return None
     except (KeyboardInterrupt, GeneratorExit):
         raise
-    except BaseException as error:  # it could not be sent to a process, or back
-        return failed_row(task, error_text(error)), None
+    except BaseException as error:  # something could not be sent to a process, or back
+        if len(group) > 1:
+            return Performed([], together=1)
+        return Performed([(failed_row(group[0], error_text(error)), None)])

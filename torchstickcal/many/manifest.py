@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -89,9 +89,9 @@ class Manifest:
     def __init__(self, descriptor: int) -> None:
         self._descriptor = descriptor
 
-    def append(self, row: SessionRow) -> None:
-        """Write a row, whole, to the disk."""
-        _write_whole(self._descriptor, (json_text(asdict(row), indent=None) + "\n").encode())
+    def append(self, rows: Sequence[SessionRow]) -> None:
+        """Write rows, whole, to the disk."""
+        _write_whole(self._descriptor, "".join(json_text(asdict(row), indent=None) + "\n" for row in rows).encode())
 
 
 @contextmanager

@@ -74,7 +74,8 @@ def calibrate_many(
 ) -> ManyCalibrations:
     """Calibrate many sessions, except for those that the folder ``out`` already has.
 
-    The results do not depend on the executor, nor on the order. With ``out``, each session has a row in a manifest as soon as
+    The results do not depend on the executor, nor on the order, up to rounding errors: small sessions are adjusted side by side
+    in batches. With ``out``, each session has a row in a manifest as soon as
     its results are written: whatever is interrupted, the same call goes on with the sessions that are missing. A session that
     cannot be calibrated is a row with its error, and is not tried again unless ``retry`` asks for it.
 
@@ -143,14 +144,15 @@ def calibrate_many(
         plan = _Plan(sources, settings, prepare, earlier)
         count = jobs if total is None else max(1, min(jobs, total))
         done = on_executor(plan.tasks(), executor) if executor else on_processes(plan.tasks(), count, memory_bytes, prepare)
-        for row, calibration in stack.enter_context(closing(done)):
+        for together in stack.enter_context(closing(done)):
             if manifest is not None:
-                manifest.append(row)
-            if calibration is not None:
-                calibrations[row.name] = calibration
-            found[row.name] = row
-            if progress:
-                progress(plan.done_earlier + len(found), total, row)
+                manifest.append([row for row, _ in together])
+            for row, calibration in together:
+                if calibration is not None:
+                    calibrations[row.name] = calibration
+                found[row.name] = row
+                if progress:
+                    progress(plan.done_earlier + len(found), total, row)
     if folder is not None:
         write_tables(folder)
     rows = earlier | found

@@ -80,8 +80,8 @@ def check_enough(needed_bytes: int, total_bytes: int) -> None:
         )
 
 
-def needed_bytes(observations: Observations) -> int:
-    """An upper estimate of the memory that a calibration needs."""
-    keypoints = observations.keypoints.numel() // 2
+def needed_bytes(*sessions: Observations) -> int:
+    """An upper estimate of the memory that the calibration of some sessions needs, side by side."""
+    keypoints = sum(session.keypoints.numel() // 2 for session in sessions)
     further = max(0, keypoints - _MOST_CHECKED)
     return _SESSION_BYTES + _KEYPOINT_BYTES * (keypoints - further) + _FURTHER_KEYPOINT_BYTES * further

@@ -1,4 +1,4 @@
-"""One session, from reading it to its written results and its row; runs in any process."""
+"""Sessions, from reading them to their written results and their rows; runs in any process."""
 
 from __future__ import annotations
 
@@ -6,18 +6,22 @@ import hashlib
 import pickle
 import re
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass, is_dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
-from torchstickcal.config import Config
+from torchstickcal.config import Config, with_refine
+from torchstickcal.errors import CalibrationError, ConfigError
 from torchstickcal.files import atomic_set, remove_remains
+from torchstickcal.io import LoadedSession
 from torchstickcal.many.manifest import CONVERGED, FAILED, NOT_CONVERGED, SessionRow
 from torchstickcal.many.memory import Budget, check_enough, needed_bytes
 from torchstickcal.many.sources import Source
+from torchstickcal.observations import Observations
 from torchstickcal.pipeline.calibrate import calibrate
+from torchstickcal.pipeline.together import KEYPOINTS_TOGETHER, calibrate_together
 from torchstickcal.result import Calibration
 
 RESULTS = "results"
@@ -71,18 +75,43 @@ def use_budget(budget: Budget | None, prepare: Callable[[], object] | None) -> N
         prepare()
 
 
-def perform(task: Task) -> tuple[SessionRow, Calibration | None]:
-    """Calibrate a session. Whatever goes wrong is its row; the result is returned where it is not written."""
-    began = time.perf_counter()
-    try:
-        if task.prepare:
-            task.prepare()
-        settings: Settings = pickle.loads(task.settings)
-        calibration, folder = _calibrated(task.source, settings)
-    except Exception as error:
-        return failed_row(task, error_text(error), time.perf_counter() - began), None
-    row = _row(task, calibration, time.perf_counter() - began, folder)
-    return row, calibration if settings.out is None else None
+Done = tuple[SessionRow, Calibration | None]
+"""What became of a session, and its calibration where it is not written."""
+
+
+class Performed(NamedTuple):
+    """What a call has done of the tasks that it was given."""
+
+    done: list[Done]
+    """of the first of them"""
+    together: int | None = None
+    """how many such sessions are worth calibrating together; None if that is not known"""
+
+
+def perform(tasks: Sequence[Task]) -> Performed:
+    """Calibrate sessions. Whatever goes wrong with one is its row.
+
+    Small ones are adjusted side by side, as many as are worth it. A large one is calibrated only if it is the only task: the
+    others need not wait for it.
+    """
+    taken: list[_Loaded | Done] = []
+    sessions: list[_Loaded] = []
+    for task in tasks:
+        loaded = _loaded(task)
+        if isinstance(loaded, _Loaded):
+            if len(tasks) > 1 and loaded.together == 1:
+                return Performed(_rows(taken), together=1)
+            if sessions and not _fit_together([*sessions, loaded]):
+                break
+            sessions.append(loaded)
+        taken.append(loaded)
+    return Performed(_rows(taken), min((one.together for one in taken if isinstance(one, _Loaded)), default=None))
+
+
+def _rows(taken: Sequence[_Loaded | Done]) -> list[Done]:
+    """What becomes of sessions that fit together, or of one, and of those that could not be read."""
+    calibrated = iter(_calibrated([one for one in taken if isinstance(one, _Loaded)]))
+    return [next(calibrated) if isinstance(one, _Loaded) else one for one in taken]
 
 
 def failed_row(task: Task, error: str, seconds: float = 0.0) -> SessionRow:
@@ -122,29 +151,109 @@ def folder_of(name: str) -> str:
     return f"{plain}-{hashlib.sha256(name.encode()).hexdigest()[:8]}"
 
 
-def _calibrated(source: Source, settings: Settings) -> tuple[Calibration, str | None]:
-    """A session's calibration, and where its results have been written.
+@dataclass(frozen=True)
+class _Loaded:
+    """A session that has been read."""
+
+    task: Task
+    settings: Settings
+    session: LoadedSession
+    seconds: float
+    """that this took"""
+
+    @property
+    def observations(self) -> Observations:
+        return self.session.observations
+
+    @property
+    def together(self) -> int:
+        """How many such sessions are worth calibrating together."""
+        return max(1, KEYPOINTS_TOGETHER // max(1, self.observations.keypoints.numel() // 2))
+
+
+def _loaded(task: Task) -> _Loaded | Done:
+    """A session that is read, or the row that says why it cannot be."""
+    began = time.perf_counter()
+    try:
+        if task.prepare:
+            task.prepare()
+        settings: Settings = pickle.loads(task.settings)
+        return _Loaded(task, settings, task.source.load(), time.perf_counter() - began)
+    except Exception as error:
+        return failed_row(task, error_text(error), time.perf_counter() - began), None
+
+
+def _fit_together(sessions: Sequence[_Loaded]) -> bool:
+    """Whether sessions are so small that they are worth calibrating side by side, and may need that much memory."""
+    every = [session.observations for session in sessions]
+    allowed = [b for b in (sessions[0].settings.memory_bytes, _budget and _budget.total_bytes) if b is not None]
+    small = sum(one.keypoints.numel() // 2 for one in every) <= KEYPOINTS_TOGETHER
+    return small and all(needed_bytes(*every) <= bytes for bytes in allowed)
+
+
+def _calibrated(sessions: Sequence[_Loaded]) -> list[Done]:
+    """What becomes of sessions that fit together, or of one."""
+    if not sessions:
+        return []
+    needed = needed_bytes(*(session.observations for session in sessions))
+    try:
+        if (allowed := sessions[0].settings.memory_bytes) is not None:
+            check_enough(needed, allowed)
+        with _budget.taking(needed) if _budget else nullcontext():
+            began = time.perf_counter()
+            found = _side_by_side(sessions)
+            share = (time.perf_counter() - began) / len(sessions)
+            return [_concluded(session, calibration, share) for session, calibration in zip(sessions, found, strict=True)]
+    except CalibrationError as error:  # there is not enough memory
+        return [(failed_row(session.task, error_text(error), session.seconds), None) for session in sessions]
+
+
+def _side_by_side(sessions: Sequence[_Loaded]) -> list[Calibration | None]:
+    """The calibrations of sessions; None for those that have to be calibrated alone."""
+    settings = sessions[0].settings
+    if len(sessions) == 1:
+        return [None]
+    try:
+        config = settings.config if settings.refine is None else with_refine(settings.config, settings.refine)
+    except ConfigError:  # each session says it
+        return [None] * len(sessions)
+    return calibrate_together([session.observations for session in sessions], config)
+
+
+def _concluded(loaded: _Loaded, calibration: Calibration | None, seconds: float) -> Done:
+    """The results of a session, written where they are to be, and its row.
+
+    Args:
+        loaded: the session.
+        calibration: what was found together with others; None to calibrate it now.
+        seconds: the session's share of the time of that.
+    """
+    began, task, settings = time.perf_counter() - loaded.seconds - seconds, loaded.task, loaded.settings
+    try:
+        if calibration is None:
+            calibration = calibrate(loaded.observations, settings.config, refine=settings.refine)
+        folder = None if settings.out is None else _written(calibration, loaded, settings.out)
+        row = _row(task, calibration, time.perf_counter() - began, folder)
+    except Exception as error:
+        return failed_row(task, error_text(error), time.perf_counter() - began), None
+    return row, calibration if settings.out is None else None
+
+
+def _written(calibration: Calibration, loaded: _Loaded, out: Path) -> str:
+    """Write the results of a session; where they are in the folder of all results.
 
     Raises:
-        CalibrationError: if it cannot be calibrated.
-        OSError: if results cannot be written.
+        OSError: if they cannot be written.
     """
-    session = source.load()
-    needed = needed_bytes(session.observations)
-    if settings.memory_bytes is not None:
-        check_enough(needed, settings.memory_bytes)
-    with _budget.taking(needed) if _budget else nullcontext():
-        calibration = calibrate(session.observations, settings.config, refine=settings.refine)
-        if settings.out is None:
-            return calibration, None
-        name = f"{RESULTS}/{folder_of(source.name)}"
-        provenance = {"session": source.origin, "name": source.name}
-        if session.notes:
-            provenance |= {"notes": list(session.notes)}
-        with atomic_set(settings.out / name) as folder:
-            settings.write(calibration, folder, provenance)
-        remove_remains(settings.out / name)
-        return calibration, name
+    source = loaded.task.source
+    name = f"{RESULTS}/{folder_of(source.name)}"
+    provenance: dict[str, Any] = {"session": source.origin, "name": source.name}
+    if loaded.session.notes:
+        provenance["notes"] = list(loaded.session.notes)
+    with atomic_set(out / name) as folder:
+        loaded.settings.write(calibration, folder, provenance)
+    remove_remains(out / name)
+    return name
 
 
 def _row(task: Task, calibration: Calibration, seconds: float, folder: str | None) -> SessionRow:

@@ -44,6 +44,10 @@ class CorrelationGates:
     nothing: Tensor
     """(B, P), points whose errors do not last where those of others do"""
 
+    def of(self, sessions: slice) -> CorrelationGates:
+        """The decisions about some of the sessions."""
+        return CorrelationGates(self.significant[sessions], self.nothing[sessions])
+
     def replaced(self, where: Tensor, other: CorrelationGates) -> CorrelationGates:
         """The decisions with some sessions (B,), True where, taken from another."""
         significant, nothing = ((self.significant, other.significant), (self.nothing, other.nothing))

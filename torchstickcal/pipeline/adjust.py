@@ -7,7 +7,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Hashable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
 
 import torch
@@ -72,7 +72,7 @@ class Adjustment:
 
     @staticmethod
     def stack(sessions: Sequence[Adjustment]) -> Adjustment:
-        """Sessions of equal shape that have just begun, as one batch."""
+        """Sessions of one kind that have just begun or ended a stage, as one batch, without results."""
         return Adjustment(
             tuple(session.observations[0] for session in sessions),
             tuple(session.frames[0] for session in sessions),
@@ -82,6 +82,18 @@ class Adjustment:
             State.stack([session.state for session in sessions]),
             Labels.stack([session.labels for session in sessions]),
             records=((),) * len(sessions),
+        )
+
+    @property
+    def kind(self) -> Hashable:
+        """What sessions have in common that can be adjusted as one batch by one configuration."""
+        m = self.measurements
+        lens = m.cameras.distortion
+        return (
+            *(m.pixels.shape, m.pixels.dtype, m.pixels.device, m.frames, m.point_names),
+            *(m.cameras.matrix.dtype, m.cameras.fisheye, None if lens is None else lens.shape),
+            *(tuple(m.sticks.flatten().tolist()), tuple(m.stick_sigma_m.tolist())),
+            *(self.refined, m.motion is None, self.asynchronous),
         )
 
     @property
@@ -159,6 +171,20 @@ class Adjustment:
             results=(),
             records=((),),
         )
+
+    def alone(self, session: int) -> Adjustment:
+        """One of the sessions with its results and records."""
+        sessions = len(self.records)
+        return replace(
+            self[session],
+            results=tuple(result.of(session) for result in self.results),
+            records=(tuple(record.of_one(sessions) for record in self.records[session]),),
+        )
+
+    def after(self, earlier: Adjustment) -> Adjustment:
+        """With the results and records that the same session had before."""
+        records = tuple((*before, *own) for before, own in zip(earlier.records, self.records, strict=True))
+        return replace(self, results=(*earlier.results, *self.results), records=records)
 
     def replaced(self, where: Tensor, other: Adjustment) -> Adjustment:
         """The adjustment with the results of some sessions (B,), True where, taken from another of the same sessions."""

@@ -3,20 +3,21 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Generator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, Protocol
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple, Protocol
 
 from torchstickcal.config import Config, Refine, load_config, with_noise, with_refine
 from torchstickcal.errors import RigError
 from torchstickcal.losses import LOSSES
 from torchstickcal.model.unknowns import REFINEMENTS
 from torchstickcal.observations import Observations
-from torchstickcal.pipeline.adjust import adjust_points
+from torchstickcal.pipeline.adjust import Adjustment, adjust_cameras, adjust_points
 from torchstickcal.pipeline.check import CameraCheck
 from torchstickcal.pipeline.conclude import conclude
 from torchstickcal.pipeline.run import Run
+from torchstickcal.pipeline.scale import ending_in_scale
 from torchstickcal.pipeline.selection import ModelSelection
 from torchstickcal.pipeline.start import Poses, starting_from
 from torchstickcal.result import Calibration
@@ -120,17 +121,50 @@ def _calibrated(
     start: Poses | None = None,
     left_out: tuple[str, ...] = (),
 ) -> Calibration:
+    steps = calibration_steps(observations, config, callback, start, left_out)
+    adjusted: Adjustment | None = None
+    while True:
+        try:
+            due = steps.send(adjusted)
+        except StopIteration as ended:
+            return ended.value
+        adjusted = due.adjust(due.adjustment, due.run)
+
+
+class Due(NamedTuple):
+    """An adjustment that is due, of one session."""
+
+    adjust: Callable[[Adjustment, Run], Adjustment]
+    adjustment: Adjustment
+    run: Run
+
+
+def calibration_steps(
+    observations: Observations,
+    config: Config,
+    callback: Callback | None = None,
+    start: Poses | None = None,
+    left_out: tuple[str, ...] = (),
+) -> Generator[Due, Adjustment | None, Calibration]:
+    """One calibration, which asks whoever runs it for its main adjustments: those of other sessions may join them.
+
+    Raises:
+        CalibrationError: as :func:`calibrate`.
+    """
     began = time.perf_counter()
     if (on_start := getattr(callback, "on_start", None)) is not None:
         on_start(observations)
+    config = ending_in_scale(config, len(observations.sticks))
     run = Run(config, callback.on_iteration if callback else ignore_record)
     models = ModelSelection(observations, run, start)
 
     # 1. Synchronise: where the cameras' frames clearly do not belong together, find the time offsets.
     clocks = models.searched() if "time_offset" in models.allowed and models.unsynchronised else None
+    begun = models.begun() if clocks is None else None
 
     # 2. Initialise rig and points, and 3. adjust them in stages, at the time offsets at which the views fit together best.
-    adjusted, clocks = models.adjusted(clocks)
+    first = None if begun is None else (yield Due(adjust_cameras, begun, run))
+    adjusted, clocks = models.adjusted(clocks, first)
 
     # 4. Check the given lenses and clocks when that is first asked for; with refine="auto", estimate what is contradicted.
     check = CameraCheck(adjusted, config.camera_groups)
@@ -138,7 +172,8 @@ def _calibrated(
         adjusted, check = models.refined_where_contradicted(adjusted, check)
 
     # 5. Trajectories: with the cameras fixed, smooth each point as its noise and its motion demand.
-    ended = adjust_points(adjusted, run)
+    ended = yield Due(adjust_points, adjusted, run)
+    assert ended is not None
 
     # 6. Conclude: covariance, and the result in the caller's dtype. Its quality is judged when it is first asked for.
     def unsynchronised() -> bool:

@@ -8,16 +8,19 @@ from functools import partial
 import torch
 from torch import Tensor
 
+from torchstickcal.config import Config
 from torchstickcal.model.correlation import error_correlation
 from torchstickcal.model.unknowns import CameraUnknown, RigEstimate, all_unknowns
 from torchstickcal.pipeline.adjust import Adjustment
 from torchstickcal.pipeline.check import CameraCheck
+from torchstickcal.pipeline.height import HEIGHT_STD
 from torchstickcal.pipeline.run import Run
+from torchstickcal.pipeline.scale import height_sets_scale
 from torchstickcal.pipeline.synchronise import ClockEstimate, CommonFrames
 from torchstickcal.quality.evidence import Evidence
 from torchstickcal.quality.judge import judged
 from torchstickcal.result import Calibration, CameraParameter
-from torchstickcal.solvers.uncertainty import camera_covariance, likelihood, ruler_covariance
+from torchstickcal.solvers.uncertainty import camera_covariance, likelihood, ruler_covariance, scale_covariance, without_scale
 from torchstickcal.workers import on_worker
 
 
@@ -45,7 +48,7 @@ def conclude(
     inliers, sigma_px = measurements.by_frame(ended.last.inliers[0]), ended.last.sigma_px[0]
     points = measurements.by_frame(ended.state.points[0]).where(inliers.any(0), torch.nan).movedim(0, -1)
     cameras = measurements.cameras_at(ended.state).to(torch.float64)[0]
-    noise, ruler = _covariances(ended)
+    noise, ruler = _covariances(ended, run.config)
     covariance = noise + ruler
     tangents = 6 * (measurements.num_cameras - 1)
     unknowns = _unknowns(ended, check, covariance[tangents:, tangents:])
@@ -105,10 +108,10 @@ def residuals_of(ended: Adjustment) -> Tensor:
     return measurements.by_frame(residuals[0]).movedim(1, -1)
 
 
-def _covariances(ended: Adjustment) -> tuple[Tensor, Tensor]:
+def _covariances(ended: Adjustment, config: Config) -> tuple[Tensor, Tensor]:
     """Covariances of the cameras' tangents and further unknowns where they were estimated last; NaN if they never were.
 
-    The first comes from the errors of the keypoints, the second from those of the sticks' given lengths. Nothing is known of a
+    The first comes from the errors of the keypoints, the second from those of the given lengths. Nothing is known of a
     camera whose keypoints do not agree with those of the others.
     """
     last, measurements = ended.last_camera_stage, ended.measurements
@@ -120,6 +123,8 @@ def _covariances(ended: Adjustment) -> tuple[Tensor, Tensor]:
     sigma_px, times = ended.last.sigma_px, last.correlation_frames
     correlation = error_correlation(kept, last.state, sigma_px)
     noise = camera_covariance(likelihood(kept, last.losses, sigma_px * times.sqrt()), last.state, correlation, times)[0]
+    if height_sets_scale(config, kept.sticks.shape[0]):
+        return without_scale(noise, kept, last.state), scale_covariance(kept, last.state, HEIGHT_STD)
     return noise, ruler_covariance(kept, last.state, sigma_px)
 
 

@@ -41,6 +41,10 @@ class NoiseLevels(NamedTuple):
     acceleration_m: Tensor
     """(B, P), standard deviation of the second difference over frames, metres; infinite where no loss needs it"""
 
+    def of(self, sessions: slice) -> NoiseLevels:
+        """The levels of some of the sessions."""
+        return NoiseLevels(*(level[sessions] for level in self))
+
     def replaced(self, where: Tensor, other: NoiseLevels) -> NoiseLevels:
         """The levels with some sessions (B,), True where, taken from another."""
         return NoiseLevels(*(torch.where(where[:, None], new, old) for old, new in zip(self, other, strict=True)))
@@ -71,6 +75,11 @@ class NoiseGates:
     """the keypoints from which the noise is estimated"""
     correlation: CorrelationGates | None
     """None where no loss asks for how long errors last"""
+
+    def of(self, sessions: slice) -> NoiseGates:
+        """The decisions about some of the sessions."""
+        chosen = replace(self.chosen, mask=self.chosen.mask[sessions])
+        return NoiseGates(chosen, None if self.correlation is None else self.correlation.of(sessions))
 
     def replaced(self, where: Tensor, other: NoiseGates) -> NoiseGates:
         """The decisions with some sessions (B,), True where, taken from another."""

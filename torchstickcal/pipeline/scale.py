@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
 
-from torchstickcal.config import Config
+from torchstickcal.config import Config, ScaleSettings
 from torchstickcal.errors import ConfigError, ObservationError
 from torchstickcal.model.measurements import Measurements
+from torchstickcal.pipeline.height import BETWEEN_HEAD_AND_ANKLES, segments_of, standing_in
 
 _OUTLIER_CUT = 3.5
 _MAD_TO_SIGMA = 1.4826
@@ -46,24 +47,55 @@ class Ruler:
 
 
 def rulers(measurements: Measurements, config: Config) -> list[Ruler]:
-    """What the scale comes from: the configuration's ``scale``, else the sticks among the points that take part.
+    """What the scale comes from: the configuration's ``scale``, else the sticks among the points that take part, else the body
+    height.
 
     Raises:
         ConfigError: if there is neither.
-        ObservationError: if ``scale`` names a point that the session does not have.
+        ObservationError: if ``scale`` names a point that the session does not have, or if the height says nothing of its
+            points.
     """
     if config.scale is not None:
-        start, end = (tuple(map(measurements.point_index, names)) for names in (config.scale.start, config.scale.end))
-        return [Ruler(start, end, torch.full_like(measurements.cameras.focal_px[:, 0], config.scale.length_m), rigid=False)]
+        return [_given(config.scale, measurements)]
     sticks = zip(measurements.sticks.tolist(), measurements.lengths_m.unbind(1), strict=True)
     if found := [Ruler((start,), (end,), length_m, rigid=True) for (start, end), length_m in sticks]:
         return found
+    if config.height_m is not None:
+        length = torch.full_like(measurements.cameras.focal_px[:, 0], config.height_m)
+        parts = segments_of(measurements.point_names)
+        return [Ruler(part.start, part.end, part.share * length, part.rigid) for part in parts]
     raise ConfigError(
         "nothing sets the scale",
         where="scale",
         got=f"no stick, points = {config.points!r}",
-        expected="a stick among the points that take part, or a [scale] table with a known length",
+        expected="a stick among the points that take part, a body height, or a [scale] table with a known length",
+        remedy="Give the stick with --stick, or the athlete's height with --height.",
     )
+
+
+def _given(scale: ScaleSettings, measurements: Measurements) -> Ruler:
+    """The length of a configuration; where a skeleton lacks the head or feet of its points, another point takes their place."""
+    ends: list[tuple[int, ...]] = []
+    higher: list[float] = []
+    for names in (scale.start, scale.end):
+        found = [standing_in(name, measurements.point_names) for name in names]
+        ends.append(tuple(measurements.point_index(point) for point, _ in found))
+        higher.append(sum(height for _, height in found) / max(len(found), 1))
+    length_m = scale.length_m * (1 + (higher[0] - higher[1]) / BETWEEN_HEAD_AND_ANKLES)
+    return Ruler(ends[0], ends[1], torch.full_like(measurements.cameras.focal_px[:, 0], length_m), rigid=False)
+
+
+def ending_in_scale(config: Config, num_sticks: int) -> Config:
+    """The configuration for a session: where a body height sets the scale, the cameras are brought to scale last."""
+    if not height_sets_scale(config, num_sticks):
+        return config
+    free = [name for name, stage in config.stages.items() if stage.cameras == "free"]
+    return replace(config, stages={n: replace(s, rescale=s.rescale or n in free[-1:]) for n, s in config.stages.items()})
+
+
+def height_sets_scale(config: Config, num_sticks: int) -> bool:
+    """Whether the scale comes from a body height, because there is nothing better."""
+    return config.height_m is not None and config.scale is None and (num_sticks == 0 or config.points == "joints")
 
 
 def check_scale(measurements: Measurements, known: Sequence[Ruler]) -> None:

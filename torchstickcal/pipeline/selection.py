@@ -84,12 +84,22 @@ class ModelSelection:
         """The time offsets, by the motion in the images."""
         return search_offsets(*self._keypoints_and_reach)
 
-    def adjusted(self, clocks: ClockEstimate | None) -> tuple[Adjustment, ClockEstimate | None]:
+    def begun(self) -> Adjustment | None:
+        """At the given time offsets, with the first estimate of rig and points; None where the cameras are no one rig there."""
+        try:
+            return begin(self._observations, self._run, self._named_lenses, poses=self._start)
+        except RigError:
+            return None
+
+    def adjusted(
+        self, clocks: ClockEstimate | None, first: Adjustment | None = None
+    ) -> tuple[Adjustment, ClockEstimate | None]:
         """Adjusted at the time offsets at which the views fit together best, of those given and those searched for.
 
         Args:
             clocks: time offsets that were searched for. If there are none, and the cameras do not fit together at those given,
                 they are searched for now.
+            first: what has begun at the given time offsets, with its cameras adjusted; None to do that now.
 
         Returns:
             The adjustment with all that the configuration refines, and the time offsets that were searched for.
@@ -97,7 +107,7 @@ class ModelSelection:
         Raises:
             RigError: if the cameras cannot be placed in one rig.
         """
-        found, clocks = self._found(clocks)
+        found, clocks = self._found(clocks, first)
         if self._start is not None and not any(_fits(one, _CLEAR_SHARE, _CLEAR_FOCAL_SHARE) for one in found):
             found, clocks = self._without_start(found, clocks)
         best = min(found, key=_median_squared_residual)
@@ -119,13 +129,15 @@ class ModelSelection:
         self._start = start
         return found, clocks
 
-    def _found(self, clocks: ClockEstimate | None) -> tuple[list[Adjustment], ClockEstimate | None]:
+    def _found(
+        self, clocks: ClockEstimate | None, first: Adjustment | None = None
+    ) -> tuple[list[Adjustment], ClockEstimate | None]:
         """What was adjusted at all time offsets that were tried; arguments and errors as of :meth:`adjusted`."""
         found = [] if clocks is None else self._at_offsets(clocks)
         failure: RigError | None = None
         if not any(map(_fits, found)):
             try:
-                found.append(self._adjusted_at(self._named_lenses))
+                found.append(self._at_nearest_frames(first) if first else self._adjusted_at(self._named_lenses))
             except RigError as error:
                 failure = error
         if clocks is None and "time_offset" in self.allowed and not any(map(_fits, found)):

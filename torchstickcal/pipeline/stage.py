@@ -56,6 +56,19 @@ class StageResult(NamedTuple):
         """(B, P), as many keypoints of each point counted as one, because their errors are alike."""
         return self.noise.correlation_frames
 
+    def of(self, session: int) -> StageResult:
+        """The result of one of the sessions."""
+        one = slice(session, session + 1)
+        return self._replace(
+            state=self.state[one],
+            minimum=self.minimum[one],
+            losses={name: loss.of(one) for name, loss in self.losses.items()},
+            inliers=self.inliers[one],
+            noise=self.noise.of(one),
+            gates=self.gates.of(one),
+            records=(self.records[session].of_one(len(self.records)),),
+        )
+
     def replaced(self, where: Tensor, other: StageResult) -> StageResult:
         """The result with some sessions (B,), True where, taken from another of the same stage."""
         return StageResult(

@@ -27,6 +27,7 @@ from torchstickcal.quality.evidence import Evidence
 from torchstickcal.quality.findings.keypoints import keypoints as keypoint_findings
 from torchstickcal.reconstruction import Reconstruction
 from torchstickcal.result import Calibration
+from torchstickcal.solvers import Listener, ignore_record
 from torchstickcal.solvers.elimination.normal_equations import NormalEquations
 from torchstickcal.solvers.uncertainty import likelihood, point_covariances
 from torchstickcal.workers import on_worker
@@ -53,6 +54,7 @@ def triangulate(
     calibration: Calibration | Rig,
     config: str | Path | Mapping[str, Any] | Config = "default",
     turned: str | None = None,
+    listener: Listener = ignore_record,
 ) -> Reconstruction:
     """Find the points of a recording, in metres, with cameras that were calibrated before and have not been moved since.
 
@@ -66,6 +68,7 @@ def triangulate(
         config: as of :func:`torchstickcal.calibrate`. ``points``, ``precision``, ``relabel``, ``synchronise`` and the last
             stage with ``cameras = "held"`` count.
         turned: how images were turned after the calibration: ``left``, ``right`` (a quarter, as a viewer sees it) or ``back``.
+        listener: called after each iteration of the stages ``points`` and ``trajectories``.
 
     Raises:
         CalibrationError: if a camera is missing, or the calibration has no poses in a known unit.
@@ -102,7 +105,8 @@ def triangulate(
     device = observations.keypoints.device
     rotations, translations = (part.to(device) for part in rig.poses())
     world = calibration.world if isinstance(calibration, Calibration) else rig.world
-    found = on_worker(device, _reconstructed, given, (rotations, translations), covariance.to(device), load_config(config))
+    run = Run(load_config(config), listener)
+    found = on_worker(device, _reconstructed, given, (rotations, translations), covariance.to(device), run)
     return replace(found, world=world or found.world, warnings=(*notes, *found.warnings), sticks=observations.sticks)
 
 
@@ -133,10 +137,8 @@ class _Clocks(NamedTuple):
     """(C,)"""
 
 
-def _reconstructed(
-    observations: Observations, poses: tuple[Tensor, Tensor], covariance: Tensor, config: Config
-) -> Reconstruction:
-    run = Run(config)
+def _reconstructed(observations: Observations, poses: tuple[Tensor, Tensor], covariance: Tensor, run: Run) -> Reconstruction:
+    config = run.config
     robust, smooth = _stages(config)
     timed = config.synchronise and (observations.fps is not None or observations.timestamps is not None)
     offsets: Tensor | None = None

@@ -9,6 +9,7 @@ frames.
 from __future__ import annotations
 
 import itertools
+from dataclasses import replace
 from typing import NamedTuple
 
 import torch
@@ -112,14 +113,13 @@ def _predicted(part: Adjustment, kept: Measurements, noise: Tensor, ruler: Tenso
     if not len(kept.sticks) or not bool(kept.stick_active.any()):
         return None
     shifts = _shifts_without_folds(part, kept)
-    ends = _only(kept, kept.sticks.flatten().unique())
-    state, step = part.state, torch.zeros_like(part.state.points)
-    loss = ReprojectionLoss(part.last.sigma_px[:, None, None])
+    chosen = kept.sticks.flatten().unique()
+    ends, state = _only(kept, part.state, chosen)
+    loss = ReprojectionLoss(part.last.sigma_px[:, None, None, chosen])
     system = NormalEquations(Objective(ends, {"reprojection": loss}), state, cameras_free=True)
     for _ in range(_TRIANGULATIONS):
         held = NormalEquations(Objective(ends, {"reprojection": loss}), state, cameras_free=False)
-        step = held.step().points
-        state = State(state.rotations, state.translations, state.points + step, state.unknowns)
+        state = replace(state, points=state.points + held.step().points)
     response = ends.by_frame(system.point_response()[0])
     points = ends.by_frame(state.points[0]).clone()
     for frames, shift in shifts:
@@ -157,33 +157,50 @@ def _shifts_without_folds(part: Adjustment, kept: Measurements) -> list[tuple[sl
     information, gradient = system.reduced[0], system.reduced_gradient[0]
     everything = solve_information(information, gradient)
     bounds = [kept.frames * number // _FOLDS for number in range(_FOLDS + 1)]
+    windows = [slice(start, stop) for start, stop in itertools.pairwise(bounds) if stop > start]
     found: list[tuple[slice, Tensor]] = []
-    for start, stop in itertools.pairwise(bounds):
-        if stop == start:
-            continue
-        window = slice(start, stop)
-        columns = kept.columns_of(window)
-        own = State(state.rotations, state.translations, state.points[..., columns], state.unknowns)
-        fold = NormalEquations(Objective(kept.within(window), objective.losses), own, cameras_free=True)
-        left = solve_information(information - _without_prior(fold), gradient - fold.reduced_gradient[0])
-        found.append((window, everything - left))
+    for _, alike in itertools.groupby(sorted(windows, key=_length), _length):
+        together = list(alike)
+        for window, own in zip(together, _shares(objective, state, together), strict=True):
+            left = solve_information(information - own[0], gradient - own[1])
+            found.append((window, everything - left))
     return found
 
 
-def _without_prior(fold: NormalEquations) -> Tensor:
-    """A fold's share of the reduced system: the prior of the unknowns belongs to the session."""
-    information = fold.reduced[0].clone()
-    _, _, prior = fold.objective.linearise_prior(fold.state)
-    poses = len(information) - prior.shape[1]
-    information.diagonal()[poses:] -= prior[0]
-    return information
+def _length(window: slice) -> int:
+    return window.stop - window.start
 
 
-def _only(kept: Measurements, points: Tensor) -> Measurements:
-    """The measurements of some points alone."""
-    chosen = torch.zeros(kept.points_per_frame, dtype=torch.bool, device=kept.pixels.device)
-    chosen[points] = True
-    return kept.keeping(chosen.repeat(kept.frames))
+def _shares(objective: Objective, state: State, windows: list[slice]) -> list[tuple[Tensor, Tensor]]:
+    """What windows of equal length contribute to the reduced system and its gradient, worked out as sessions side by side.
+
+    The prior of the unknowns is no part of it: it belongs to the session.
+    """
+    kept = objective.measurements
+    points = torch.cat([state.points[..., kept.columns_of(window)] for window in windows])
+    rotations, translations = (t.expand(len(windows), *t.shape[1:]) for t in (state.rotations, state.translations))
+    own = State(rotations, translations, points, state.unknowns.expand(len(windows), -1))
+    parts = Measurements.stack([kept.within(window) for window in windows])
+    folds = NormalEquations(Objective(parts, objective.losses), own, cameras_free=True)
+    _, _, prior = folds.objective.linearise_prior(own)
+    information = folds.reduced.clone()
+    information.diagonal(dim1=1, dim2=2)[:, information.shape[1] - prior.shape[1] :] -= prior
+    return list(zip(information, folds.reduced_gradient, strict=True))
+
+
+def _only(kept: Measurements, state: State, points: Tensor) -> tuple[Measurements, State]:
+    """The measurements and the state of some points alone, among which all ends of sticks are."""
+    first = torch.arange(0, kept.num_columns, kept.points_per_frame, device=points.device)
+    columns = (first[:, None] + points).flatten()
+    chosen = replace(
+        kept,
+        pixels=kept.pixels[..., columns],
+        confidence=kept.confidence[..., columns],
+        sticks=torch.searchsorted(points, kept.sticks),
+        motion=kept.motion and kept.motion.at(columns),
+        point_names=kept.point_names and tuple(kept.point_names[point] for point in points.tolist()),
+    )
+    return chosen, replace(state, points=state.points[..., columns])
 
 
 def _metre(predictions: list[Prediction]) -> tuple[float, float]:

@@ -114,13 +114,17 @@ class Evidence:
         least, median = float(self.agreement.min()), float(self.agreement.median())
         agree = least > max(_CONSISTENT_SHARE, _BEHIND_OTHERS * median)
         person = float(self.ended.labels.other_person[0].double().mean(1).max()) < _OTHER_PERSON_SHARE
+        near = not bool(self.absurd_focals.any())
+        return self.ended.converged and agree and person and near and self.noise_mrad < _NOISY_MRAD
+
+    @cached_property
+    def absurd_focals(self) -> Tensor:
+        """(C,), whether the keypoints ask for a focal length so far from the given one that something else must be wrong."""
         focal = self.unknowns["focal"]
         wanted = focal.value if focal.refined else focal.suggested
-        far = ((wanted / focal.given).clamp_min(1e-3).log().abs() > _NEAR_FOCAL) & (
-            self.contradictions["focal"] > _FAR_SIGMAS**2
-        )
-        near = not self.observations.intrinsics_known or not bool(far.any())
-        return self.ended.converged and agree and person and near and self.noise_mrad < _NOISY_MRAD
+        far = (wanted / focal.given).clamp_min(1e-3).log().abs() > _NEAR_FOCAL
+        known = self.observations.intrinsics_known
+        return far & (self.contradictions["focal"] > _FAR_SIGMAS**2) if known else torch.zeros_like(far)
 
     @cached_property
     def centres(self) -> Tensor:

@@ -62,7 +62,8 @@ def exposed_points(motion: Motion, rig: CameraRig, times: Array, readout_s: floa
         times: at which each camera exposes the first row of its frames, (C, F), seconds.
         readout_s: read-out time, seconds.
     """
-    points = np.stack([motion.points(camera) for camera in times])
+    different, own = np.unique(times, axis=0, return_inverse=True)  # most often all cameras have the same
+    points = np.stack([motion.points(camera) for camera in different])[own.ravel()]
     if readout_s == 0:
         return points
     height = rig.image_size[1]

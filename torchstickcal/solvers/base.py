@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from enum import StrEnum
 from typing import Protocol
 
@@ -85,6 +85,11 @@ class StageRecord:
     stop: Stop
     seconds: float
     iterations: tuple[IterationRecord, ...]
+
+    def of_one(self, sessions: int) -> StageRecord:
+        """The record of one of so many sessions as that of a session alone, with its share of the time."""
+        iterations = tuple(replace(record, session=0) for record in self.iterations)
+        return replace(self, seconds=self.seconds / sessions, iterations=iterations)
 
 
 Listener = Callable[[IterationRecord], None]

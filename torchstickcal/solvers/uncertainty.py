@@ -80,14 +80,38 @@ def ruler_covariance(measurements: Measurements, state: State, sigma_px: Tensor)
         sigma_px: noise of each point's keypoints, (B, P).
     """
     m = measurements
-    centres = (state.rotations[0].mT @ state.translations[0][..., None])[1:, :, 0]
-    tangents = torch.nn.functional.pad(centres, (0, 3)).flatten()
-    direction = torch.nn.functional.pad(tangents, (0, m.unknowns.count))
     noise = m.by_frame(point_variances(m, state, sigma_px))[0][:, m.sticks].sum(-1)
     tolerance, lengths = m.stick_sigma_m, m.lengths_m[0]
     information = (lengths.square() / (tolerance.square() + noise)).where(m.stick_active[0], 0.0).sum(0)
     share = information / information.sum().clamp_min(1e-300)
-    return (share * tolerance / lengths).square().sum() * torch.outer(direction, direction)
+    return scale_covariance(m, state, float((share * tolerance / lengths).square().sum().sqrt()))
+
+
+def scale_covariance(measurements: Measurements, state: State, std: float) -> Tensor:
+    """Covariance (6 (C - 1) + K, 6 (C - 1) + K) that an error of the whole scene's scale adds, for one session.
+
+    Args:
+        measurements: the session.
+        state: the solution.
+        std: standard deviation of the scale, as a share of it.
+    """
+    direction = _scale_direction(measurements, state)
+    return std**2 * torch.outer(direction, direction)
+
+
+def without_scale(covariance: Tensor, measurements: Measurements, state: State) -> Tensor:
+    """A covariance (6 (C - 1) + K, 6 (C - 1) + K) of a session whose scale is given, where the keypoints say nothing of it."""
+    direction = _scale_direction(measurements, state)
+    unit = direction / direction.norm()
+    kept = torch.eye(len(unit), dtype=unit.dtype, device=unit.device) - torch.outer(unit, unit)
+    return kept @ covariance @ kept
+
+
+def _scale_direction(measurements: Measurements, state: State) -> Tensor:
+    """How cameras' tangents and further unknowns (6 (C - 1) + K) change with the logarithm of the scale."""
+    centres = (state.rotations[0].mT @ state.translations[0][..., None])[1:, :, 0]
+    tangents = torch.nn.functional.pad(centres, (0, 3)).flatten()
+    return torch.nn.functional.pad(tangents, (0, measurements.unknowns.count))
 
 
 def point_variances(measurements: Measurements, state: State, sigma_px: Tensor) -> Tensor:

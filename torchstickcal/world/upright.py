@@ -114,7 +114,7 @@ def _footholds(body: Body, up: Tensor, along: Tensor) -> tuple[Tensor, Tensor]:
 def _places(track: Tensor, up: Tensor, along: Tensor) -> list[Tensor]:
     """Points (3,) at which a foot (G, 3) stands: the lowest in each place in which it stays."""
     total = int(track.isfinite().all(-1).sum())
-    known = track[moved_around(track) < _STILL]
+    known = track[(moved_around(track) < _STILL) & track.isfinite().all(-1)]
     cells = (known @ along.mT / _CELL).floor().long()
     found: list[Tensor] = []
     for cell in cells.unique(dim=0):

@@ -42,6 +42,7 @@ class Inputs:
         cube: keypoints of a calibration cube.
         orientations: unit direction vectors of the limbs :data:`BONES` in the frame of each camera, (C, F, B, 3); NaN where
             not known.
+        case: name of the session.
 
     Example:
         >>> from torchstickcal.benchmark.baselines import BASELINES, Inputs
@@ -57,6 +58,7 @@ class Inputs:
     bone_lengths_m: Mapping[tuple[str, str], float] | None = None
     cube: CubeViews | None = None
     orientations: Array | None = None
+    case: str = ""
 
 
 @dataclass(frozen=True)
@@ -67,6 +69,7 @@ class Estimate:
         rotations: (C, 3, 3).
         translations: (C, 3), metres. NaN for a camera whose pose could not be estimated.
         status: ``converged``, or one sentence that says why not.
+        up_to_scale: whether the unit of the translations is not known: the size of the rig is then fitted to the truth.
 
     Example:
         >>> identity = torch.eye(3, dtype=torch.float64).expand(4, 3, 3)
@@ -77,6 +80,7 @@ class Estimate:
     rotations: Tensor
     translations: Tensor
     status: str
+    up_to_scale: bool = False
 
     @staticmethod
     def of_state(state: State, status: str) -> Estimate:

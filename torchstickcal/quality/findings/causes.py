@@ -15,6 +15,8 @@ from torchstickcal.quality.trials import Rest, Sight, hypotheses, moved_within, 
 _SOUND_SHARE, _GAIN, _CLEAR_GAIN = 0.6, 0.15, 0.08
 """Share of keypoints that agree in a sound camera, and the least gain of an explanation over none, where that is wrong and
 where it is nearly right."""
+_ALIKE = 0.05
+"""Difference of shares up to which the simpler of two explanations is the one."""
 _WHOLE_SHARE = 0.8
 _ALIEN_SHARE = 0.75
 """Share of a camera's keypoints that agree, over that of the others, below which it shows something else."""
@@ -34,7 +36,8 @@ def causes(evidence: Evidence) -> Iterator[Finding]:
         return
     agreement = evidence.agreement * (1 - evidence.ended.labels.other_person[0].double().mean(1))
     order = agreement.argsort().tolist()
-    suspects = [camera for camera in order if float(agreement[camera]) < _SUSPECT_SHARE] or order
+    absurd = evidence.absurd_focals.tolist()
+    suspects = [camera for camera in order if float(agreement[camera]) < _SUSPECT_SHARE or absurd[camera]] or order
     best: tuple[float, int, Rest] | None = None
     for camera in suspects[:_MOST_SUSPECTS]:
         rest = without(evidence, camera)
@@ -45,7 +48,7 @@ def causes(evidence: Evidence) -> Iterator[Finding]:
     _, camera, rest = best
     worse = float(agreement[camera]) < _BEHIND_OTHERS * rest.share
     noisy = evidence.noise_mrad > _NOISY_MRAD and rest.noise_mrad < _NOISE_RATIO * evidence.noise_mrad
-    if rest.share < _SOUND_SHARE or not (worse or noisy):
+    if rest.share < _SOUND_SHARE or not (worse or noisy or absurd[camera]):
         return
     if (finding := _explained(evidence, camera, rest)) is not None:
         yield finding
@@ -76,7 +79,8 @@ def _explained(evidence: Evidence, camera: int, rest: Rest) -> Finding | None:
         )
 
     found = [(h, placed[0].share) for h in hypotheses() if (placed := rest.placed(h.changed(sight))) is not None]
-    hypothesis, share = max(found, key=lambda one: one[1], default=(None, 0.0))
+    largest = max((share for _, share in found), default=0.0)
+    hypothesis, share = next((one for one in found if one[1] >= largest - _ALIKE), (None, 0.0))
     if hypothesis is not None and share > max(_SOUND_SHARE, as_given + (_GAIN if as_given < _SOUND_SHARE else _CLEAR_GAIN)):
         return cause(hypothesis.code, hypothesis.what, hypothesis.advice, share)
     if as_given < _WHOLE_SHARE and (moved := moved_within(rest, sight)) is not None:

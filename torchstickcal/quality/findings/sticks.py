@@ -6,6 +6,7 @@ from collections.abc import Iterator
 
 from torchstickcal.losses import ReprojectionLoss
 from torchstickcal.model.objective import Objective
+from torchstickcal.pipeline.scale import height_sets_scale
 from torchstickcal.quality.evidence import Evidence
 from torchstickcal.quality.finding import Finding, Severity
 from torchstickcal.quality.registry import findings
@@ -57,8 +58,15 @@ def _contradicted(evidence: Evidence) -> Iterator[Finding]:
 
 
 def _scale(evidence: Evidence) -> Iterator[Finding]:
-    """A scale that few frames determine, or that is not known well."""
-    kept = evidence.kept
+    """A scale that few frames determine, that is not known well, or for which a body height was given in vain."""
+    kept, config = evidence.kept, evidence.config
+    if config.height_m is not None and not height_sets_scale(config, len(kept.sticks)):
+        yield Finding(
+            "height_unused",
+            Severity.NOTE,
+            f"A length that is known better sets the scale: the body height of {config.height_m:g} m is not used.",
+            "Leave the height out.",
+        )
     if len(kept.sticks):
         frames = int(kept.stick_active[0].any(-1).sum())
         if frames < _FEW_FRAMES < kept.frames:
@@ -79,7 +87,9 @@ def _scale(evidence: Evidence) -> Iterator[Finding]:
             "scale_imprecise",
             Severity.SERIOUS if unknown else Severity.CAUTION,
             f"The scale has a standard deviation of {std:.1%}: all distances are uncertain by this share.",
-            "Measure the stick's length better (Stick.sigma_m), and record it for longer and closer to the cameras.",
+            "Measure the stick's length better (Stick.sigma_m), and record it for longer and closer to the cameras."
+            if len(kept.sticks)
+            else "Record a stick of known length: nothing else gives a scale that is better than a few per cent.",
             figure=std,
             limit=_UNKNOWN_SCALE if unknown else _IMPRECISE_SCALE,
             unit="share",

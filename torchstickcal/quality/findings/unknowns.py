@@ -7,6 +7,7 @@ from collections.abc import Iterator
 from torchstickcal.model.unknowns import CameraUnknown, all_unknowns
 from torchstickcal.quality.evidence import Evidence
 from torchstickcal.quality.finding import Finding, Severity
+from torchstickcal.quality.lags import frames_are_apart
 from torchstickcal.quality.registry import findings
 from torchstickcal.result import CameraParameter
 
@@ -35,7 +36,7 @@ def unknowns(evidence: Evidence) -> Iterator[Finding]:
 @findings("clocks", "cameras whose clocks are apart or uncertain, by the motion in the images")
 def clocks(evidence: Evidence) -> Iterator[Finding]:
     """Findings about clocks, of the motion in the images."""
-    if evidence.unsynchronised() and not _in_step(evidence):
+    if evidence.unsynchronised() and not _in_step(evidence) and frames_are_apart(evidence) is not False:
         yield Finding(
             "unsynchronised",
             Severity.SERIOUS if _apart(evidence) else Severity.CAUTION,
