@@ -61,8 +61,8 @@ def in_world(spec: SessionSpec, times: Array) -> Array:
     return np.concatenate([points[:, : len(JOINTS)], hips, points[:, len(JOINTS) :]], axis=1)
 
 
-def scene(sport: str, seed: int, fps: float, sigma_px: float, stick_sigma_px: float) -> Scene:
-    frames = round(spec_seconds(sport) * fps)
+def scene(sport: str, seed: int, fps: float, sigma_px: float, stick_sigma_px: float, seconds: float | None = None) -> Scene:
+    frames = round((seconds or spec_seconds(sport)) * fps)
     spec = SessionSpec(sport, sport, seed=seed, cameras=4, frames=frames, fps=fps, layout="ring", path="circle")
     rng = np.random.default_rng(seed)
     rig = camera_rig("ring", 4, rng, LENS, 4.5)
@@ -130,7 +130,7 @@ def all_angles(names: tuple[str, ...], points: Array, up: Array) -> dict[str, Ar
     return {name: angle.of(derived) for name, angle in ANGLES.items() if not missing_points(angle, derived)}
 
 
-def apart(first: Array, second: Array) -> Array:
+def apart(first: Array, second: Array | float) -> Array:
     """Differences of angles, -180 to 180 degrees."""
     return (first - second + 180.0) % 360.0 - 180.0
 
@@ -211,7 +211,7 @@ def pooled(found: Analysis, true: dict[str, Array], by_std: bool = False) -> Arr
     for name, values in true.items():
         error = apart(found.curves[name].values, values)
         if ANGLES[name].turns:
-            error = error - error[np.nanargmin(np.abs(found.curves[name].values))]
+            error = apart(error, error[np.nanargmin(np.abs(found.curves[name].values))])
         if name.endswith("_shoulder_plane"):  # without a meaning where the arm hangs down
             error = np.where(np.abs(found.curves[name].std) < 10, error, np.nan)
         errors.append(error / found.curves[name].std if by_std else error)

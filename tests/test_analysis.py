@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import importlib.util
 import json
 from dataclasses import replace
 from pathlib import Path
@@ -11,14 +12,16 @@ import numpy as np
 import pytest
 import torch
 
-from torchstickcal import Calibration, CalibrationError, Observations, Stick, calibrate
+from torchstickcal import Calibration, CalibrationError, Observations, Stick, calibrate, triangulate
 from torchstickcal.analysis import ANGLES, EVENTS, SPORTS, Analysis, analyse, multiple_correlation
 from torchstickcal.analysis.angles import missing_points, with_derived
-from torchstickcal.analysis.phases import at, events_of, swing_peaks
+from torchstickcal.analysis.interpolation import at
+from torchstickcal.analysis.phases import events_of, swing_peaks
 from torchstickcal.analysis.smoothing import from_sphere, on_sphere, smoother
 from torchstickcal.analysis.stick import StickMotion
 from torchstickcal.analysis.tracks import tracks_of
 from torchstickcal.cli import main
+from torchstickcal.io import Rig, write_npz
 from torchstickcal.simulate import Motion, action
 from torchstickcal.simulate.rigs import Lens, camera_rig
 from torchstickcal.simulate.skeleton import JOINTS
@@ -50,6 +53,20 @@ def recorded(sport: str, seconds: float, sigma_px: float = 1.5, fps: float = FPS
         point_names=NAMES,
     )
     return calibrate(observations), points @ rig.rotations[0].T + rig.translations[0], rig.rotations[0] @ UP
+
+
+def seen_by(calibration: Calibration, points: np.ndarray) -> Observations:
+    """Keypoints of points in the frame of a calibration, with errors of a pixel."""
+    moved = torch.from_numpy(points).flatten(0, 1) @ calibration.rotations.mT + calibration.translations[:, None]
+    exact = calibration._cameras().project(moved).unflatten(1, points.shape[:2])
+    return Observations(
+        exact + torch.from_numpy(np.random.default_rng(9).standard_normal(exact.shape)),
+        calibration.intrinsics,
+        Stick("butt", "tip", action("golf").stick_m),
+        camera_names=calibration.camera_names,
+        fps=FPS,
+        point_names=NAMES,
+    )
 
 
 @pytest.fixture(scope="module")
@@ -131,27 +148,34 @@ class TestAngles:
 
 
 class TestSmoothing:
-    def test_cubic_motion_is_not_bent(self):
+    def test_clear_motion_is_hardly_bent(self):
         times = np.arange(60) / FPS
         track = (2 + 3 * times - 40 * times**2 + 30 * times**3)[:, None, None]
         value, slope = smoother(times, track, np.full((60, 1), 1e-6))(track)
-        np.testing.assert_allclose(value, track, atol=1e-8)
-        np.testing.assert_allclose(slope[:, 0, 0], 3 - 80 * times + 90 * times**2, atol=1e-5)
+        np.testing.assert_allclose(value, track, atol=3e-4)  # of a noise of 1e-3
+        inner = slice(5, -5)
+        np.testing.assert_allclose(slope[inner, 0, 0], (3 - 80 * times + 90 * times**2)[inner], atol=0.02)
+        assert np.isnan(slope[0])  # an end alone says little of a velocity
+        line = 2 + 3 * times[:, None, None]
+        np.testing.assert_allclose(smoother(times, line, np.full((60, 1), 1e-6))(line)[0], line, atol=1e-9)
 
-    def test_stated_gain_is_right_and_short_gaps_are_bridged(self):
-        rng, times = np.random.default_rng(0), np.arange(400) / FPS
-        true = np.stack([np.sin(3 * times), np.cos(3 * times), times], axis=-1)[:, None].repeat(20, 1)
-        noisy = true + 0.01 * rng.standard_normal(true.shape)
-        noisy[100:103], noisy[200:220] = np.nan, np.nan
-        smooth = smoother(times, noisy, np.full((400, 20), 1e-4))
-        value, slope = smooth(noisy)
-        assert np.isfinite(value[100:103]).all()
-        assert np.isnan(value[205:215]).all()
-        speed = np.stack([3 * np.cos(3 * times), -3 * np.sin(3 * times), np.ones(400)], axis=-1)[:, None]
-        for error, gain in ((value - true, smooth.gains[..., 0]), (slope - speed, smooth.gains[..., 1])):
-            ratio = error / (0.01 * gain[..., None])
-            assert 0.9 < np.sqrt(np.nanmean(np.square(ratio))) < 1.25
-        assert np.nanmedian(smooth.gains[..., 0]) < 0.4
+    @pytest.mark.parametrize("turns_hz", [0.5, 2.0, 6.0])
+    def test_draws_are_as_wrong_as_the_estimate_and_short_gaps_are_bridged(self, turns_hz: float):
+        """Of fast motions too, where what smoothing leaves out is as large as the noise."""
+        rng, times = np.random.default_rng(0), np.arange(300) / FPS
+        phases, speed = rng.uniform(0, 6, 10), 2 * np.pi * turns_hz
+        angle = speed * times[:, None] + phases
+        true = np.stack([np.sin(angle), np.cos(angle)], axis=-1)
+        estimates = true + 0.01 * rng.standard_normal((21, *true.shape))
+        estimates[1:] += estimates[0] - true
+        estimates[:, 100:103], estimates[:, 200:220] = np.nan, np.nan
+        value, slope = smoother(times, estimates[0], np.full((300, 10), 1e-4))(estimates)
+        assert np.isfinite(value[:, 100:103]).all()
+        assert np.isnan(value[:, 205:215]).all()
+        for found, exact in ((value, true), (slope, speed * np.stack([np.cos(angle), -np.sin(angle)], axis=-1))):
+            error, stated = found[0] - exact, np.sqrt(np.square(found[1:] - found[0]).mean(0))
+            assert 0.7 < np.sqrt(np.nanmean(np.square(error / stated))) < 1.3
+        assert np.nanmedian(np.abs(value[0] - true)) < 0.9 * 0.01 * 0.6745
 
     def test_directions_that_turn_evenly_are_not_bent(self):
         times = np.arange(50) / FPS
@@ -162,9 +186,8 @@ class TestSmoothing:
         inner = slice(10, -10)
         np.testing.assert_allclose(unit[inner], direction[inner], atol=1e-9)
         np.testing.assert_allclose(np.linalg.norm(rate, axis=-1)[inner], 20, rtol=1e-9)
-        assert np.isnan(rate[0]).all()  # too few frames on one side for a velocity
         in_space = smoother(times, direction, np.full((50, 1), 1e-2))(direction)[1]
-        assert np.linalg.norm(in_space, axis=-1)[inner].min() < 19.5
+        assert np.linalg.norm(in_space, axis=-1)[inner].max() < 19.8
 
 
 class TestTracks:
@@ -330,10 +353,10 @@ class TestRepeats:
 def test_command_writes_tables_and_pictures(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     calibration, _, _ = recorded("kendo", 5.4, fps=50.0)
     calibration.save(tmp_path / "points.npz")
-    assert main(["analyse", str(tmp_path), "--sport", "kendo"]) == 0
+    assert main(["analyse", str(tmp_path), "--sport", "kendo", "--write", "trc"]) == 0
     assert "tempo" in capsys.readouterr().out
     files = sorted(file.name for file in (tmp_path / "analysis").iterdir())
-    assert files == ["analysis.json", "curves.csv", "curves.png", "repeated.csv", "repeated.png", "swings.csv"]
+    assert files == ["analysis.json", "curves.csv", "curves.png", "points.trc", "repeated.csv", "repeated.png", "swings.csv"]
     content = json.loads((tmp_path / "analysis" / "analysis.json").read_text())
     assert len(content["swings"]) == 2
     assert 0.9 < content["multiple_correlation"]["stick_turn_rate"]["value"] <= 1
@@ -345,6 +368,61 @@ def test_command_writes_tables_and_pictures(tmp_path: Path, capsys: pytest.Captu
     assert [row["per_cent"] for row in repeated[:2]] == ["0", "1"]
 
 
+def test_triangulated_recording_is_analysed_too(golf, golf_analysis, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    """And its C3D file has the phases as events."""
+    calibration, true, _ = golf
+    given = seen_by(calibration, true)
+    calibration.save(tmp_path / "points.npz")
+    write_npz(tmp_path / "swing.npz", given)
+    formats = ["--write", "c3d"] if importlib.util.find_spec("ezc3d") else []
+    command = ["triangulate", str(tmp_path / "swing.npz"), "--calibration", str(tmp_path / "points.npz"), "--analyse", "golf"]
+    assert main([*command, "--out", str(tmp_path / "out"), *formats]) == 0
+    assert "tempo" in capsys.readouterr().out
+    swing = json.loads((tmp_path / "out" / "analysis" / "analysis.json").read_text())["swings"][0]
+    for event in EVENTS:
+        assert swing["events"][event]["value"] == pytest.approx(golf_analysis.swings[0].events[event].value, abs=1.5 / FPS)
+    if formats:
+        import ezc3d
+
+        event = ezc3d.c3d(str(tmp_path / "out" / "analysis" / "points.c3d"))["parameters"]["EVENT"]
+        assert event["LABELS"]["value"] == list(EVENTS)
+        np.testing.assert_allclose(event["TIMES"]["value"][1], [swing["events"][name]["value"] for name in EVENTS], atol=1e-4)
+
+
 def test_command_without_a_calibration_says_so(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     assert main(["analyse", str(tmp_path)]) == 2
     assert "torchstickcal calibrate" in capsys.readouterr().err
+
+
+class TestOtherRecordings:
+    def test_frame_of_the_world_changes_no_angle(self, golf):
+        calibration, _, up = golf
+        same = analyse(calibration, "golf", up=up, draws=5)
+        placed = calibration.in_world("athlete")
+        assert abs(tracks_of(placed).up @ [0, 0, 1]) > np.cos(np.radians(3))
+        found = analyse(placed, "golf", up=placed.rotations[0].T.numpy() @ up, draws=5)
+        for curve in ("left_elbow_flexion", "trunk_lean", "tip_speed"):
+            np.testing.assert_allclose(found.curves[curve].values, same.curves[curve].values, atol=1e-4)
+            assert 0.7 < np.nanmedian(found.curves[curve].std / same.curves[curve].std) < 1.4
+
+    def test_vertical_is_that_of_a_measured_frame(self, golf):
+        placed = golf[0].in_world("athlete")
+        tilted = replace(placed, world=replace(placed.world, name="points"))
+        assert tracks_of(tilted).up.tolist() == [0, 0, 1]
+        assert "z axis of the frame" in tracks_of(tilted).notes[0]
+
+    def test_tracks_of_what_was_triangulated(self, golf):
+        """By fewer cameras in another order, and with cameras of a file, of whose errors nothing is known."""
+        calibration, true, _ = golf
+        given = seen_by(calibration, true)
+        some = [2, 0, 3]
+        names = [calibration.camera_names[number] for number in some]
+        fewer = replace(given, keypoints=given.keypoints[some], intrinsics=given.intrinsics[some], camera_names=names)
+        found = triangulate(fewer, Rig.of_calibration(calibration))
+        assert not found.covariance.any()
+        tracks = tracks_of(found)
+        noise = np.sqrt(tracks.variances)[..., None]
+        assert 0.8 < np.sqrt(np.nanmean(np.square((tracks.points - true) / noise))) < 1.2
+        without = replace(found, sticks=())
+        with pytest.raises(CalibrationError, match="a recording with a stick"):
+            analyse(without, "golf")

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 EXAMPLES = sorted((Path(__file__).parents[1] / "examples").glob("*.py"))
-LONG = {"benchmark_lenses_and_clocks", "from_video_to_swing", "joint_training"}
+LONG = {"benchmark_lenses_and_clocks", "from_video_to_swing", "joint_training", "swings_of_a_golfer"}
 """Examples that take 20 s and more."""
 
 

@@ -247,6 +247,17 @@ def test_c3d_marks_points_that_are_not_known(tmp_path: Path):
     assert np.allclose(file["data"]["points"][:3][:, known], expected[:, known], atol=1e-3)
 
 
+def test_c3d_has_events_in_minutes_and_seconds_since_its_first_frame(tmp_path: Path):
+    ezc3d = pytest.importorskip("ezc3d")
+    late = replace(motion(), times=70.0 + motion().times, events=(("top", 70.03), ("impact 2", 191.5)))
+    write_calibration(tmp_path / "a.c3d", late, "c3d")
+    event = ezc3d.c3d(str(tmp_path / "a.c3d"))["parameters"]["EVENT"]
+    assert event["USED"]["value"][0] == 2
+    assert event["LABELS"]["value"] == ["top", "impact 2"]
+    assert np.allclose(event["TIMES"]["value"], [[0, 2], [0.03, 1.5]], atol=1e-4)
+    write_calibration(tmp_path / "a.trc", late, "trc")  # a format without events leaves them out
+
+
 def test_c3d_without_its_package_is_one_clear_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setitem(sys.modules, "ezc3d", None)
     with pytest.raises(CalibrationError, match=r"need the package ezc3d.*pip install ezc3d"):

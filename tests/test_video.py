@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+import re
 import struct
 from collections.abc import Iterator
 from pathlib import Path
@@ -11,10 +12,12 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+import torch
 
-from torchstickcal import CalibrationError, FileFormatError
+from torchstickcal import Calibration, CalibrationError, FileFormatError
 from torchstickcal.cli import main
-from torchstickcal.io import read_recording
+from torchstickcal.io import Rig, RigCamera, read_recording, write_camera_toml
+from torchstickcal.metrics import pose_errors
 from torchstickcal.simulate import Lens, Motion, action
 from torchstickcal.simulate.footage import CameraFilm, Exposure, Markers, markers_of, write_video
 from torchstickcal.simulate.rigs import camera_rig
@@ -321,3 +324,62 @@ class TestNetworks:
         for make in (lambda: SimccModel(tmp_path / "any.onnx"), RtmlibModel):
             with pytest.raises(CalibrationError, match=r"torchstickcal\[video\]"):
                 make()
+
+
+class TestCalibratingVideos:
+    RIG = camera_rig("ring", 3, np.random.default_rng(5), Lens(image_size=SIZE, focal_px=300.0), 3.0)
+
+    @pytest.fixture
+    def arguments(self, tmp_path: Path) -> list[str]:
+        """Videos of a stick that is swung, drawn from its true places, and the arguments to calibrate them."""
+        phase = np.arange(40) / 3
+        start = np.stack([0.5 * np.sin(phase), 0.5 * np.cos(0.7 * phase), 1 + 0.3 * np.sin(1.3 * phase)], axis=-1)
+        along = np.stack([np.cos(0.9 * phase), np.sin(1.1 * phase), np.cos(0.6 * phase + 1)], axis=-1)
+        along /= np.linalg.norm(along, axis=-1, keepdims=True)
+        points = np.stack([start, start + 0.8 * along], axis=1)
+        pixels = self.RIG.project(np.repeat(points[None], 3, axis=0))
+        videos = []
+        for camera, moments in enumerate(pixels):
+            pictures = [
+                picture((*ends[0], YELLOW), (*ends[1], RED)) if np.isfinite(ends).all() else picture() for ends in moments
+            ]
+            videos.append(str(written(tmp_path / f"cam{camera}.mp4", pictures, 40.0)))
+        lenses = [RigCamera(f"cam{n}", matrix, image_size=SIZE) for n, matrix in enumerate(self.RIG.intrinsics)]
+        write_camera_toml(tmp_path / "lenses.toml", Rig.of(lenses))
+        stick = ["--stick", "tape_yellow", "tape_red", "0.8"]
+        return [*videos, "--tape", "yellow,red", *stick, "--intrinsics", str(tmp_path / "lenses.toml")]
+
+    def test_videos_are_calibrated_in_one_command(
+        self, arguments: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    ):
+        out, folder = tmp_path / "results", tmp_path / "results-keypoints"
+        command = ["calibrate", *arguments, "--out", str(out)]
+        assert main(command) in (0, 3)
+        assert "note: cam2: 40 frames" in capsys.readouterr().err
+        found = Calibration.load(out / "points.npz")
+        assert found.fps == pytest.approx(40, rel=1e-3)
+        truth = torch.from_numpy(self.RIG.rotations), torch.from_numpy(self.RIG.translations)
+        assert pose_errors(found.rotations, found.translations, *truth).mean_translation_m < 0.05
+        assert main(command) in (0, 3)
+        assert "cam0: done before" in capsys.readouterr().err
+
+        recording = read_recording(folder)
+        assert [view.image_size for view in recording.views] == [SIZE] * 3
+        about = json.loads((folder / "videos.json").read_text())
+        about["cam1"]["fps"] = 50.0
+        (folder / "videos.json").write_text(json.dumps(about))
+        recording = read_recording(folder)
+        assert recording.fps is None
+        assert "different frame rates: 40, 50, 40 Hz" in recording.notes[0]
+
+    def test_what_cannot_be_meant_is_refused(self, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+        (tmp_path / "cam1.mp4").write_bytes(b"")
+        (tmp_path / "keypoints.csv").write_text("camera,frame,point,x,y\n")
+        for arguments, message in (
+            (["cam1.mp4"], "nothing to look for"),
+            (["cam1.mp4", "keypoints.csv", "--tape", "red"], "Give videos alone|--tape out"),
+            (["keypoints.csv", "--tape", "red"], "Leave --tape out"),
+        ):
+            given = [str(tmp_path / word) if "." in word else word for word in arguments]
+            assert main(["calibrate", *given, "--out", str(tmp_path / "results")]) == 2
+            assert re.search(message, capsys.readouterr().err)

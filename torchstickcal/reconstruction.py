@@ -52,6 +52,18 @@ class Reconstruction:
     """(C,), time by which each camera's frames begin after those of the first camera, seconds; zero where not estimated"""
     time_offsets_std: Tensor
     """(C,), its standard deviation; NaN where not estimated"""
+    rotations: Tensor
+    """(C, 3, 3), world to camera, of the calibration; as the next five, for the cameras of the recording in their order"""
+    translations: Tensor
+    """(C, 3), world to camera, metres"""
+    intrinsics: Tensor
+    """(C, 3, 3), camera matrices, for the images of the recording"""
+    distortion: Tensor | None
+    """(C, D), OpenCV's order; None for perfect lenses"""
+    fisheye: bool
+    """whether ``distortion`` is of OpenCV's fisheye model"""
+    covariance: Tensor
+    """(6 (C - 1), 6 (C - 1)), as of a :class:`Calibration`; zero where the calibration says nothing of it"""
     sticks: tuple[Stick, ...]
     fps: float | None
     point_names: tuple[str, ...] | None

@@ -9,19 +9,23 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torchstickcal.analysis.angles import ANGLES, Angle, missing_points, with_derived
-from torchstickcal.analysis.phases import EVENTS, Sport, at, events_of, sport_named, swing_peaks
+from torchstickcal.analysis.interpolation import at
+from torchstickcal.analysis.phases import EVENTS, Sport, events_of, lowest_at, sport_named, swing_peaks
 from torchstickcal.analysis.repeats import multiple_correlation, normalised
 from torchstickcal.analysis.smoothing import smoother
 from torchstickcal.analysis.stick import StickMotion, StickSmoother
 from torchstickcal.analysis.tracks import Tracks, tracks_of
 from torchstickcal.errors import CalibrationError
 from torchstickcal.io.skeletons import conventional
+from torchstickcal.reconstruction import Reconstruction
 from torchstickcal.result import Calibration
 
 Array = NDArray[np.float64]
 
 DRAWS = 40
 """How many times the errors are drawn; the standard deviations are then known to 11 %."""
+_FINER = 4
+"""Moments for each frame at which events are looked for."""
 _MOST_UNKNOWN = 0.2
 """Share of the draws in which a figure may be unknown."""
 
@@ -90,7 +94,7 @@ class Analysis:
 
 
 def analyse(
-    calibration: Calibration,
+    calibration: Calibration | Reconstruction,
     sport: str = "any",
     *,
     fps: float | None = None,
@@ -99,16 +103,18 @@ def analyse(
     draws: int = DRAWS,
     seed: int = 0,
 ) -> Analysis:
-    """Angles, stick kinematics, phases and repeated swings of a calibrated session.
+    """Angles, stick kinematics, phases and repeated swings of a calibrated session, or of one that was triangulated.
 
     Points are triangulated frame by frame and smoothed over as many frames as the motion allows. For the
     standard deviations, errors of keypoints, cameras and stick length are drawn at random, and all is calculated again.
 
     Args:
-        calibration: of the session. Points need the names of a skeleton.
+        calibration: of the session, or what :func:`torchstickcal.triangulate` found in another one. Points need the names of a
+            skeleton.
         sport: whose rule for the impact is used: ``golf``, ``baseball``, ``hockey``, ``kendo`` or ``any``.
         fps: frames per second; None for those of the calibration.
-        up: the vertical in the frame of the first camera; None to take it from the cameras, if they stand level.
+        up: the vertical in the frame of the calibration; None to take it from the cameras, if they stand level, or from the
+            frame.
         stick: which of the sticks.
         draws: how many times errors are drawn, 2 or more. seed: of the random numbers.
 
@@ -136,11 +142,12 @@ def analysis_of(tracks: Tracks, sport: str, rules: Sport, stick: int, draws: int
     _check(tracks, stick, draws)
     drawn = tracks.drawn(draws, seed)
     motion = _stick_motion(tracks, drawn, stick, seed)
-    peaks = swing_peaks(tracks.times, motion.turn_rate[0])
+    times, fine = motion.finer(tracks.times, _FINER)
+    peaks = swing_peaks(times, fine.turn_rate[0])
     events = np.array(
-        [[events_of(tracks.times, motion, peak, rules, tracks.up, n) for peak in peaks] for n in range(1 + draws)]
+        [[events_of(times, fine, peak, rules, tracks.up, n) for peak in peaks] for n in range(1 + draws)]
     ).reshape(1 + draws, len(peaks), len(EVENTS))
-    angles, notes = _angles(tracks, drawn, events)
+    angles, notes = _angles(tracks, drawn, events, seed)
     stacked = {**angles, "tip_speed": motion.tip_speed, "stick_turn_rate": np.degrees(motion.turn_rate)}
     units = {name: {"tip_speed": "m/s", "stick_turn_rate": "deg/s"}.get(name, "deg") for name in stacked}
     if rules.needs_up and tracks.up is None:
@@ -157,7 +164,7 @@ def analysis_of(tracks: Tracks, sport: str, rules: Sport, stick: int, draws: int
 
 def _check(tracks: Tracks, stick: int, draws: int) -> None:
     if not 0 <= stick < len(tracks.sticks):
-        expected = f"0 to {len(tracks.sticks) - 1}"
+        expected = f"0 to {len(tracks.sticks) - 1}" if tracks.sticks else "a recording with a stick"
         raise CalibrationError("no stick of that number", where="stick", got=stick, expected=expected)
     if draws < 2:
         raise CalibrationError("too few draws for a standard deviation", where="draws", got=draws, expected="2 or more")
@@ -169,16 +176,16 @@ def _stick_motion(tracks: Tracks, drawn: Array, stick: int, seed: int) -> StickM
     *_, length_m, sigma_m = tracks.sticks[stick]
     lengths = length_m + sigma_m * np.random.default_rng((seed, 1)).standard_normal(len(drawn))
     lengths[0] = length_m
-    return StickSmoother.of(tracks, stick)(drawn, lengths)
+    return StickSmoother.of(tracks, stick)(drawn, lengths, seed)
 
 
-def _angles(tracks: Tracks, drawn: Array, events: Array) -> tuple[dict[str, Array], list[str]]:
+def _angles(tracks: Tracks, drawn: Array, events: Array, seed: int) -> tuple[dict[str, Array], list[str]]:
     """The angles (N, T) that the points determine, and sentences about those that are left out."""
     derived = with_derived(tracks.names, tracks.points, tracks.up)
     possible = {name: angle for name, angle in ANGLES.items() if not missing_points(angle, derived)}
     left_out = [name for name in ANGLES if name not in possible]
     index = [number for number, name in enumerate(tracks.names) if conventional(name) in _needed(possible)]
-    smooth, _ = smoother(tracks.times, tracks.points[:, index], tracks.variances[:, index])(drawn[:, :, index])
+    smooth, _ = smoother(tracks.times, tracks.points[:, index], tracks.variances[:, index])(drawn[:, :, index], seed)
     points = with_derived(tuple(tracks.names[number] for number in index), smooth, tracks.up)
     values = {name: _without_jumps(angle.of(points)) for name, angle in possible.items()}
     turns = [name for name, angle in possible.items() if angle.turns]
@@ -231,7 +238,7 @@ def _figures(
     takeaway, top, impact, finish = events
     times, speed = tracks.times, motion.tip_speed[number]
     inside = (times >= top) & (times <= finish)
-    peak = float(np.nanmax(speed[inside])) if np.isfinite(speed[inside]).any() else np.nan
+    peak = float(at(times, speed, lowest_at(times, -speed, np.flatnonzero(inside))))
     found = {
         "backswing": (top - takeaway, "s"),
         "downswing": (impact - top, "s"),

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from torchstickcal.analysis.interpolation import at
 from torchstickcal.analysis.stick import StickMotion
 from torchstickcal.errors import CalibrationError
 from torchstickcal.registry import suggestion
@@ -70,19 +71,19 @@ class _Swing:
 
 def _fastest(swing: _Swing) -> float:
     frames = swing.between(swing.top_s, swing.finish_s)
-    return _lowest_at(swing.times, -swing.speed, frames)
+    return lowest_at(swing.times, -swing.speed, frames)
 
 
 def _through_address(swing: _Swing) -> float:
     at_address = at(swing.times, swing.tip, swing.takeaway_s)
     frames = swing.between(swing.top_s, swing.finish_s)
-    return _lowest_at(swing.times, np.square(swing.tip - at_address).sum(-1), frames)
+    return lowest_at(swing.times, np.square(swing.tip - at_address).sum(-1), frames)
 
 
 def _lowest_point(swing: _Swing) -> float:
     assert swing.up is not None
     frames = swing.between(swing.top_s, swing.finish_s)
-    return _lowest_at(swing.times, swing.tip @ swing.up, frames)
+    return lowest_at(swing.times, swing.tip @ swing.up, frames)
 
 
 def _stopped(swing: _Swing) -> float:
@@ -191,7 +192,7 @@ def _top(times: Array, rate: Array, peak: int) -> float:
         if rate[frame] < rate[slowest]:
             slowest = frame
         if rate[frame] > rate[slowest] + FAST_AGAIN * rate[peak]:
-            return _lowest_at(times, rate, np.array([slowest]))
+            return lowest_at(times, rate, np.array([slowest]))
     return np.nan
 
 
@@ -211,7 +212,7 @@ def _crossing(times: Array, values: Array, frame: int, level: float) -> float:
     return float(times[frame] + share * (times[frame + 1] - times[frame]))
 
 
-def _lowest_at(times: Array, values: Array, frames: NDArray[np.intp]) -> float:
+def lowest_at(times: Array, values: Array, frames: NDArray[np.intp]) -> float:
     """The time of the lowest of values (T,) in some frames, between frames by a parabola."""
     if not len(frames) or np.isnan(values[frames]).all():
         return np.nan
@@ -223,18 +224,3 @@ def _lowest_at(times: Array, values: Array, frames: NDArray[np.intp]) -> float:
     if not bend > 0:
         return float(times[frame])
     return float(times[frame] + 0.25 * (before - after) / bend * (times[frame + 1] - times[frame - 1]))
-
-
-def at(times: Array, values: Array, when: Array | float) -> Array:
-    """Values (T, ...) at times (M,) or at one time, by the cubic polynomials through the four frames around; NaN outside."""
-    asked = np.atleast_1d(np.asarray(when, dtype=np.float64))
-    count = min(4, len(times))
-    first = np.clip(np.searchsorted(times, np.nan_to_num(asked)) - 2, 0, len(times) - count)
-    index = first[:, None] + np.arange(count)
-    near = times[index]
-    apart = near[:, :, None] - near[:, None, :] + np.eye(count)
-    to = np.broadcast_to((asked[:, None] - near)[:, None, :], apart.shape)
-    weights = np.where(np.eye(count, dtype=bool), 1.0, to / apart).prod(-1)
-    weights[~((asked >= times[0]) & (asked <= times[-1]))] = np.nan
-    found = (weights.reshape(*weights.shape, *[1] * (values.ndim - 1)) * values[index]).sum(1)
-    return found if np.ndim(when) else found[0]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from torchstickcal.analysis.phases import at
+from torchstickcal.analysis.interpolation import at
 
 Array = NDArray[np.float64]
 

@@ -1,14 +1,16 @@
-"""Smoothing by local polynomials, over as many frames as the motion allows.
+"""Smoothing by Gaussian processes whose time scale and size follow the motion.
 
-Around each frame a cubic polynomial is fitted to the frames before and after it. A long window averages more noise, a short one
-follows a fast swing. The window is the longest whose estimates, of position and velocity, agree with those of all shorter ones
-within their standard deviations (intersection of confidence intervals: Goldenshluger and Nemirovski, 1997).
+Around each frame a track is a straight line plus a random smooth motion (a Gaussian process with a Matern covariance of
+smoothness 7/2). How fast and how far this motion goes is what makes the values around the frame most likely, given the noise of
+the keypoints. A stick at rest is averaged over all frames around, a fast one over few. What smoothing leaves out has a known
+size too: it is drawn together with the errors of the keypoints.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from itertools import product
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,28 +19,26 @@ Array = NDArray[np.float64]
 Neighbours = Callable[[Array, int], Array]
 """Values (..., T, S, D), and an offset in frames, to the values of those frames as they are averaged, (..., T, S, D)"""
 
-HALF_WIDTHS = (2, 3, 4, 5, 6, 8, 10, 13, 16, 20, 25, 32, 40)
-"""Frames before and after."""
-_ORDER = 3
-_AGREEMENT = 1.4
-"""How many standard deviations, root mean square over the axes, estimates may differ by chance."""
+SCALES_S = 0.03 * 2 ** (np.arange(10) / 2)
+"""Time scales of motions that are tried, seconds: within one, a motion changes its direction."""
+SIZES = 10 ** np.arange(-1.0, 4.25, 0.5)
+"""Sizes of motions that are tried, in standard deviations of the values."""
+_REACH_S, _REACH_FRAMES = 0.135, (8, 24)
+"""How far before and after a frame values are used, and the least and the largest number of frames."""
 _FARTHEST_FRAMES, _FARTHEST_S = 3, 0.025
 """How far from a frame in which a point is known it is still estimated; the larger of both."""
-_LONGER_DRAWS = slice(1, None, 4)
-"""Which draws, after the estimate, are smoothed over the next longer windows."""
-_STEADY_FRAMES = 2
-"""The window of a frame is the median over so many frames before and after it."""
+_BESIDE = 2
+"""So many values are known before and after a frame whose velocity is estimated."""
+_TREND = 2
+"""Numbers of a straight line"""
 _FARTHEST_TURN_RAD = 1.75
-_LEAST_CONDITION = 1e-7
-_CLEAR = 2.2
-"""The same for the shortest window, which is noisy and is used only where a track clearly asks for it."""
-_LARGEST_SLOPE_GAINS = {2: 1.5 * 130 / 144, 3: 1.5 * 1588 / 6048}
-"""1.5 times the variance, per frame squared, of the slope in the middle of a cubic polynomial through five or seven frames with
-errors of 1. Longer windows have the second one."""
+_FREQUENCIES = np.geomspace(0.02, 60.0, 64)
+"""Of the random motions, radians per time scale"""
+_CHUNK = 2048
 
 
 def shifted(values: Array, offset: int) -> Array:
-    """Values (..., T, S, D) of ``offset`` frames later; NaN where there is none.
+    """Values (T, S, D) of ``offset`` frames later, also (..., T, S, D); NaN where there is none.
 
     Example:
         >>> shifted(np.arange(3.0).reshape(3, 1, 1), 1).ravel()
@@ -54,45 +54,63 @@ def shifted(values: Array, offset: int) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class Smoother:
-    """The weights with which frames are averaged. The same weights smooth the estimate and the draws of its errors.
+    """The weights with which frames are averaged, and the motions for which they are best."""
 
-    Every fourth draw is smoothed over the next longer window. How much it differs shows how much smoothing itself bends a
-    track.
-    """
-
+    times: Array
+    """(T,), seconds"""
     weights: Array
     """(O, T, S, 2), of each offset, for the value and for its derivative by time; NaN where nothing can be estimated"""
-    longer: Array
-    """the same of the next longer windows"""
+    scales_s: Array
+    """(T, S), time scales of the motion, seconds"""
+    sizes: Array
+    """(T, S), standard deviations of the motion along an axis, in the unit of the values"""
+    smooth: NDArray[np.bool_]
+    """(T, S), whether the motion is very smooth: Matern of smoothness 7/2, else 5/2"""
     neighbours: Neighbours
 
-    def __call__(self, values: Array) -> tuple[Array, Array]:
-        """Values (T, S, D), or an estimate and draws of it (N, T, S, D), smoothed, and their derivatives, per second."""
-        smoothed = self._averaged(self.weights, values)
-        if values.ndim == 4:
-            for whole, part in zip(smoothed, self._averaged(self.longer, values[_LONGER_DRAWS]), strict=True):
-                whole[_LONGER_DRAWS] = part
-        return smoothed
+    def __call__(self, values: Array, seed: int | tuple[int, ...] = 0) -> tuple[Array, Array]:
+        """Values (T, S, D), or an estimate and draws of its errors (N, T, S, D), smoothed, and their derivatives, per second.
 
-    def _averaged(self, weights: Array, values: Array) -> tuple[Array, Array]:
-        reach = len(weights) // 2
+        To each draw is added what smoothing leaves out of a motion, which is drawn at random by ``seed``.
+        """
+        reach = len(self.weights) // 2
         value, slope = np.zeros_like(values), np.zeros_like(values)
-        for offset, of_offset in zip(range(-reach, reach + 1), weights, strict=True):
-            used = (of_offset != 0).any(-1)[..., None]
-            if used.any():
-                near = np.where(used, self.neighbours(values, offset), 0.0)
-                value += of_offset[..., :1] * near
-                slope += of_offset[..., 1:] * near
+        for offset, of_offset in zip(range(-reach, reach + 1), self.weights, strict=True):
+            used = (np.nan_to_num(of_offset) != 0).any(-1)[..., None]
+            near = np.where(used, self.neighbours(values, offset), 0.0)
+            value += of_offset[..., :1] * near
+            slope += of_offset[..., 1:] * near
+        if values.ndim == 4:
+            rng = np.random.default_rng(seed)
+            for track in range(values.shape[2]):
+                missed = self._left_out(track, len(values) - 1, values.shape[3], rng)
+                value[1:, :, track] += missed[0]
+                slope[1:, :, track] += missed[1]
         return value, slope
 
-    @property
-    def gains(self) -> Array:
-        """(T, S, 2), root of the sum of the squared weights: what becomes of independent errors of 1."""
-        return np.sqrt(np.square(self.weights).sum(0))
+    def _left_out(self, track: int, count: int, axes: int, rng: np.random.Generator) -> tuple[Array, Array]:
+        """What smoothing leaves out of random motions of a track, and of their derivatives, (N, T, D) each.
+
+        A motion is a sum of waves, whose phases advance with the time over its scale. Smoothing multiplies a wave by the sum of
+        the weights times the wave at the offsets.
+        """
+        coefficients = rng.standard_normal((2, len(_FREQUENCIES), count * axes))
+        waves = coefficients[0] + 1j * coefficients[1]
+        scales, step = self.scales_s[:, track], np.diff(self.times, prepend=self.times[:1])
+        phases = np.exp(1j * np.cumsum(step / scales)[:, None] * _FREQUENCIES)
+        kept = np.zeros((2, *phases.shape), dtype=complex)
+        reach = len(self.weights) // 2
+        for offset, of_offset in zip(range(-reach, reach + 1), self.weights[:, :, track], strict=True):
+            wave = np.exp(1j * (_offsets(self.times, offset) / scales)[:, None] * _FREQUENCIES)
+            kept += of_offset.T[:, :, None] * wave
+        size = self.sizes[:, track, None] * np.where(self.smooth[:, track, None], _heights(7), _heights(5))
+        missed = (size * phases * (1 - kept[0]), size * phases * (1j * _FREQUENCIES / scales[:, None] - kept[1]))
+        value, slope = ((part @ waves).real.reshape(len(scales), count, axes).swapaxes(0, 1) for part in missed)
+        return value, slope
 
 
 def smoother(times: Array, values: Array, variances: Array, neighbours: Neighbours = shifted) -> Smoother:
-    """Choose windows for tracks.
+    """Choose the scale and the size of the motion of tracks, frame by frame, and the weights that are best for it.
 
     Args:
         times: (T,), seconds, ascending.
@@ -107,118 +125,133 @@ def smoother(times: Array, values: Array, variances: Array, neighbours: Neighbou
         >>> value, slope = smooth(track)
         >>> bool(np.abs(value[:, 0, 0] - np.sin(2 * np.pi * times))[5:-5].max() < 0.02)
         True
-        >>> bool(smooth.gains[100, 0, 0] < 0.6)
-        True
     """
-    frames, count = values.shape[:2]
-    reach = max(width for width in HALF_WIDTHS if width < max(frames, HALF_WIDTHS[0] + 1))
+    frames = len(times)
     step = float(np.median(np.diff(times))) if frames > 1 else 1.0
+    reach = min(max(frames - 1, _BESIDE), int(np.clip(round(_REACH_S / step), *_REACH_FRAMES)))
     offsets = range(-reach, reach + 1)
-    at = [(shifted(times[:, None, None], offset) - times[:, None, None])[..., 0] / step for offset in offsets]
-    near = [neighbours(values, offset) for offset in offsets]
-    inverse = np.where(np.isfinite(values).all(-1) & np.isfinite(variances) & (variances > 0), 1 / variances, 0.0)
-    information = [
-        np.where(np.isfinite(seen).all(-1), np.nan_to_num(shifted(inverse[..., None], offset)[..., 0]), 0.0)
-        for seen, offset in zip(near, offsets, strict=True)
-    ]
-    powers = [np.nan_to_num(a[..., None] ** np.arange(_ORDER + 1)) for a in at]
-
-    moments = np.zeros((frames, count, _ORDER + 1, _ORDER + 1))
-    sums = np.zeros((frames, count, _ORDER + 1, values.shape[-1]))
-    tried: list[tuple[Array, Array, Array]] = []
-    widths = [width for width in HALF_WIDTHS if width <= reach]
-    with np.errstate(invalid="ignore", divide="ignore"):
-        typical = np.nanmedian(np.where(inverse > 0, 1 / inverse, np.nan), axis=0, keepdims=True)
-    before = -1
-    for width in widths:
-        for distance in range(before + 1, width + 1):
-            for number in {reach - distance, reach + distance}:
-                weighted = information[number][..., None] * powers[number]
-                moments += weighted[..., :, None] * powers[number][..., None, :]
-                sums += weighted[..., :, None] * np.nan_to_num(near[number])[..., None, :]
-        before = width
-        covariance = _sure(_inverse(moments), typical * _LARGEST_SLOPE_GAINS[min(width, max(_LARGEST_SLOPE_GAINS))])
-        estimate = covariance[..., :2, :] @ sums
-        tried.append((covariance[..., :2, :], estimate, np.diagonal(covariance, axis1=-2, axis2=-1)[..., :2]))
-    determined = np.stack([np.isfinite(variance).all(-1) for _, _, variance in tried])
-    chosen = _determined_from(_steady(_longest(tried, widths)), determined)
-    rows_of = np.stack([rows for rows, _, _ in tried])
-    near_a_value = _near_a_value(inverse > 0, max(_FARTHEST_FRAMES, round(_FARTHEST_S / step)))
-
-    def weights_of(number: NDArray[np.intp]) -> Array:
-        rows = np.take_along_axis(rows_of, number[None, ..., None, None], 0)[0]
-        weights = np.zeros((len(offsets), frames, count, 2))
-        for k, offset in enumerate(offsets):
-            linear = (rows @ powers[k][..., None])[..., 0] * information[k][..., None]
-            weights[k] = np.where((np.abs(offset) <= np.array(widths)[number])[..., None], linear / [1.0, step], 0.0)
-        return np.where((np.isfinite(rows).all((-2, -1)) & near_a_value)[..., None], np.nan_to_num(weights), np.nan)
-
-    return Smoother(
-        weights_of(chosen), weights_of(_determined_from(np.minimum(chosen + 1, len(widths) - 1), determined)), neighbours
-    )
+    known = np.isfinite(values).all(-1) & np.isfinite(variances) & (variances > 0)
+    usable = np.where(known, variances, np.nan)
+    typical = np.array([np.median(v[np.isfinite(v)]) if np.isfinite(v).any() else 1.0 for v in usable.T])
+    near = np.stack([neighbours(np.where(known[..., None], values, np.nan), offset) for offset in offsets])
+    scales, sizes, smooth = _likeliest(near / np.sqrt(typical)[:, None], step)
+    noise = np.stack([shifted(usable[..., None] / typical[:, None], offset)[..., 0] for offset in offsets])
+    noise[~np.isfinite(near).all(-1)] = np.nan
+    apart = np.stack([_offsets(times, offset) for offset in offsets])
+    weights = np.empty((*noise.shape, 2))
+    for first in range(0, frames, max(1, _CHUNK // max(1, values.shape[1]))):
+        part = slice(first, first + max(1, _CHUNK // max(1, values.shape[1])))
+        weights[:, part] = _weights(apart[:, part], noise[:, part], scales[part], sizes[part], smooth[part])
+    estimated = _near_a_value(known, max(_FARTHEST_FRAMES, round(_FARTHEST_S / step)))
+    seen = np.isfinite(noise)
+    estimated &= seen.sum(0) > _TREND
+    with_slope = estimated & (seen[:reach].sum(0) >= _BESIDE) & (seen[reach + 1 :].sum(0) >= _BESIDE)
+    weights = np.where(np.stack([estimated, with_slope], axis=-1), weights, np.nan)
+    return Smoother(times, weights, scales, sizes * np.sqrt(typical), smooth, neighbours)
 
 
-def _inverse(moments: Array) -> Array:
-    """Inverses (..., n, n) of moments; NaN where a polynomial is not determined."""
-    scale = np.sqrt(np.maximum(np.diagonal(moments, axis1=-2, axis2=-1), 1e-300))
-    scaled = moments / scale[..., :, None] / scale[..., None, :]
-    determined = np.linalg.eigvalsh(scaled)[..., 0] > _LEAST_CONDITION
-    safe = np.where(determined[..., None, None], scaled, np.eye(moments.shape[-1]))
-    inverse = np.linalg.inv(safe) / scale[..., :, None] / scale[..., None, :]
-    return np.where(determined[..., None, None], inverse, np.nan)
+def _offsets(times: Array, offset: int) -> Array:
+    """(T,), seconds from each frame to the one ``offset`` frames later; 0 where there is none."""
+    return np.nan_to_num((shifted(times[:, None, None], offset) - times[:, None, None])[:, 0, 0])
 
 
-def _sure(covariance: Array, largest: Array) -> Array:
-    """Covariances (T, S, n, n), NaN where velocities are less sure than in the middle of a short window.
+def _covariance(apart: Array, smooth: NDArray[np.bool_] | bool) -> Array:
+    """Of a motion of size 1 at times apart by so many time scales: Matern of smoothness 7/2 or 5/2."""
+    z = np.where(smooth, np.sqrt(7.0), np.sqrt(5.0)) * np.abs(apart)
+    return np.where(smooth, 1 + z + 0.4 * z**2 + z**3 / 15, 1 + z + z**2 / 3) * np.exp(-z)
 
-    At the ends of a recording and beside gaps, a polynomial through few frames on one side would say nothing of the velocity.
+
+def _covariance_with_slope(apart: Array, smooth: NDArray[np.bool_] | bool) -> Array:
+    """Of the derivative of such a motion at 0 with its values at times ``apart``."""
+    z = np.where(smooth, np.sqrt(7.0), np.sqrt(5.0)) * np.abs(apart)
+    return np.where(smooth, 1.4 * (1 + z + z**2 / 3), 5 / 3 * (1 + z)) * apart * np.exp(-z)
+
+
+def _heights(freedom: int) -> Array:
+    """Of waves of :data:`_FREQUENCIES` that make a motion of size 1 and smoothness ``freedom / 2``."""
+    power = (1 + _FREQUENCIES**2 / freedom) ** (-(freedom + 1) / 2) * np.gradient(_FREQUENCIES)
+    return np.sqrt(power / power.sum())
+
+
+def _likeliest(near: Array, step: float) -> tuple[Array, Array, NDArray[np.bool_]]:
+    """Scales in seconds, sizes and smoothness (T, S) that make the values (O, T, S, D) around each frame most likely.
 
     Args:
-        covariance: of the polynomials.
-        largest: (1, S), variances that velocities may have.
+        near: values in standard deviations.
+        step: seconds between two frames.
     """
-    sure = covariance[..., 1, 1] <= largest
-    return np.where(sure[..., None, None], covariance, np.nan)
+    count, frames, tracks, axes = near.shape
+    values = _bridged(near.reshape(count, frames * tracks, axes))
+    seconds = step * (np.arange(count) - count // 2)
+    best = np.full(frames * tracks, -np.inf)
+    chosen = np.zeros((3, frames * tracks), dtype=np.intp)
+    patterns, of_pattern = np.unique(np.isfinite(values).all(-1), axis=1, return_inverse=True)
+    for number, pattern in enumerate(patterns.T):
+        if pattern.sum() <= _TREND:
+            continue
+        index = np.flatnonzero(of_pattern == number)
+        at = seconds[pattern]
+        free = np.linalg.qr(np.stack([np.ones_like(at), at], axis=-1), mode="complete")[0][:, _TREND:]
+        seen = free.T @ values[pattern][:, index].reshape(pattern.sum(), -1)
+        for smooth, (of_scale, scale) in product((True, False), enumerate(SCALES_S)):
+            spread, directions = np.linalg.eigh(free.T @ _covariance((at[:, None] - at) / scale, smooth) @ free)
+            squares = np.square(directions.T @ seen).reshape(len(spread), -1, axes).sum(-1)
+            variances = 1 + SIZES[:, None] ** 2 * np.maximum(spread, 0.0)
+            likelihood = -0.5 * ((1 / variances) @ squares + axes * np.log(variances).sum(-1, keepdims=True))
+            of_size = likelihood.argmax(0)
+            value = np.take_along_axis(likelihood, of_size[None], 0)[0]
+            better = value > best[index]
+            best[index[better]] = value[better]
+            chosen[:2, index[better]] = np.stack([np.full(better.sum(), of_scale), of_size[better]])
+            chosen[2, index[better]] = smooth
+    shape = frames, tracks
+    return SCALES_S[chosen[0]].reshape(shape), SIZES[chosen[1]].reshape(shape), chosen[2].reshape(shape) > 0
 
 
-def _longest(tried: list[tuple[Array, Array, Array]], widths: list[int]) -> NDArray[np.intp]:
-    """(T, S), number of the longest window that agrees with all shorter ones; the first one that is determined at least."""
-    shape = tried[0][1].shape[:2]
-    chosen = np.full(shape, -1)
-    going_on = np.ones(shape, dtype=bool)
-    for number, (_, estimate, variance) in enumerate(tried):
-        determined = np.isfinite(variance).all(-1)
-        agrees = np.ones(shape, dtype=bool)
-        for (_, other, more), width in zip(tried[:number], widths, strict=False):
-            ratio = np.square(estimate - other).mean(-1) / np.maximum(more - variance, 1e-9 * more)
-            allowed = _CLEAR if width == HALF_WIDTHS[0] else _AGREEMENT
-            agrees &= (_mean_around(ratio, width) <= allowed**2).all(-1)
-        going_on &= agrees | ~determined
-        chosen = np.where(determined & (going_on | (chosen < 0)), number, chosen)
-    return np.maximum(chosen, 0)
+def _bridged(values: Array) -> Array:
+    """Values (O, M, D) with gaps of at most :data:`_FARTHEST_FRAMES` frames filled by straight lines."""
+    number = np.arange(len(values))[:, None]
+    known = np.isfinite(values).all(-1)
+    before = np.maximum.accumulate(np.where(known, number, -1), axis=0)
+    after = np.minimum.accumulate(np.where(known, number, len(values))[::-1], axis=0)[::-1]
+    fill = ~known & (before >= 0) & (after < len(values)) & (after - before <= _FARTHEST_FRAMES + 1)
+    first, last = (np.take_along_axis(values, np.clip(n, 0, len(values) - 1)[..., None], 0) for n in (before, after))
+    share = ((number - before) / np.maximum(after - before, 1))[..., None]
+    return np.where(fill[..., None], first + share * (last - first), values)
 
 
-def _determined_from(chosen: NDArray[np.intp], determined: NDArray[np.bool_]) -> NDArray[np.intp]:
-    """The shortest determined windows that are not shorter than the chosen ones (T, S), else the chosen ones."""
-    allowed = determined & (np.arange(len(determined))[:, None, None] >= chosen)
-    return np.where(allowed.any(0), allowed.argmax(0), chosen)
+def _weights(apart: Array, noise: Array, scales: Array, sizes: Array, smooth: NDArray[np.bool_]) -> Array:
+    """Best weights (O, T, S, 2) of the values around each frame, for the value there and for its derivative.
 
-
-def _mean_around(values: Array, reach: int) -> Array:
-    """Means of values (T, S, 2) over the known ones of ``reach`` frames before and after; 0 where none is known."""
-    known = np.isfinite(values)
-    sums = np.stack([np.where(known, values, 0.0), known.astype(float)])
-    padded = np.pad(sums.cumsum(1), ((0, 0), (reach + 1, reach), (0, 0), (0, 0)), mode="edge")
-    padded[:, : reach + 1] = 0.0
-    total, count = padded[:, 2 * reach + 1 :] - padded[:, : -2 * reach - 1]
-    return total / np.maximum(count, 1.0)
-
-
-def _steady(chosen: NDArray[np.intp]) -> NDArray[np.intp]:
-    """The median of the windows over neighbouring frames."""
-    padded = np.pad(chosen, ((_STEADY_FRAMES, _STEADY_FRAMES), (0, 0)), mode="edge")
-    windows = np.lib.stride_tricks.sliding_window_view(padded, 2 * _STEADY_FRAMES + 1, axis=0)
-    return np.median(windows, axis=-1).astype(np.intp)
+    Args:
+        apart: (O, T), seconds from the frame.
+        noise: (O, T, S), variances of the values, relative to those of which the sizes are multiples; NaN where not known.
+        scales, sizes, smooth: (T, S), of the motion.
+    """
+    seen = np.isfinite(noise).transpose(1, 2, 0)
+    at = apart.T[:, None] / scales[..., None]
+    power = np.square(sizes)[..., None]
+    both = seen[..., :, None] & seen[..., None, :]
+    covariance = np.where(
+        both, power[..., None] * _covariance(at[..., :, None] - at[..., None, :], smooth[..., None, None]), 0.0
+    )
+    diagonal = np.arange(len(apart))
+    covariance[..., diagonal, diagonal] += np.where(seen, noise.transpose(1, 2, 0), 1.0)
+    motion = [
+        power * _covariance(at, smooth[..., None]),
+        power * _covariance_with_slope(at, smooth[..., None]) / scales[..., None],
+    ]
+    line = [np.ones_like(at), at]
+    right = np.where(seen[..., None], np.stack([*motion, *line], axis=-1), 0.0)
+    solved = np.linalg.solve(covariance, right)
+    line_rows = right[..., _TREND:].swapaxes(-1, -2)
+    wanted = np.zeros((*scales.shape, _TREND, 2))
+    wanted[..., 0, 0], wanted[..., 1, 1] = 1.0, 1 / scales
+    determined = seen.sum(-1) > _TREND
+    moments = np.where(determined[..., None, None], line_rows @ solved[..., _TREND:], np.eye(_TREND))
+    return (solved[..., :2] + solved[..., _TREND:] @ np.linalg.solve(moments, wanted - line_rows @ solved[..., :2])).transpose(
+        2, 0, 1, 3
+    )
 
 
 def _near_a_value(known: NDArray[np.bool_], reach: int) -> NDArray[np.bool_]:
@@ -249,6 +282,7 @@ def on_sphere(base: Array) -> Neighbours:
 
 def from_sphere(base: Array, tangents: Array, slopes: Array) -> tuple[Array, Array]:
     """Unit vectors and their derivatives, (..., T, S, 3), of tangents at ``base`` and the derivatives of these."""
+    tangents, slopes = (part - (part * base).sum(-1, keepdims=True) * base for part in (tangents, slopes))
     angle = np.linalg.norm(tangents, axis=-1, keepdims=True)
     shrink = np.sinc(angle / np.pi)
     unit = np.cos(angle) * base + shrink * tangents

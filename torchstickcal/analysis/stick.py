@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from torchstickcal.analysis.interpolation import at
 from torchstickcal.analysis.smoothing import Smoother, from_sphere, on_sphere, smoother
 from torchstickcal.analysis.tracks import Tracks
 
@@ -32,6 +33,17 @@ class StickMotion:
     def tip_speed(self) -> Array:
         """(N, T), metres per second."""
         return np.linalg.norm(self.tip_velocity, axis=-1)
+
+    def finer(self, times: Array, count: int) -> tuple[Array, StickMotion]:
+        """Times (count * (T - 1) + 1,) and the motion at them, by cubic polynomials between the frames (T,)."""
+        frames = np.arange(len(times))
+        moments = np.interp(np.arange(count * (len(times) - 1) + 1) / count, frames, times)
+        parts = (self.start, self.tip, self.start_velocity, self.tip_velocity)
+        start, tip, start_velocity, tip_velocity = (
+            np.moveaxis(at(times, np.moveaxis(part, 1, 0), moments), 0, 1) for part in parts
+        )
+        turn_rate = np.linalg.norm(tip_velocity - start_velocity, axis=-1) / np.linalg.norm(tip - start, axis=-1)
+        return moments, StickMotion(start, tip, start_velocity, tip_velocity, turn_rate)
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,11 +74,11 @@ class StickSmoother:
             smoother(tracks.times, along, variances / length_m**2, on_sphere(base)),
         )
 
-    def __call__(self, points: Array, lengths_m: Array) -> StickMotion:
-        """The motion by points (N, T, P, 3), with sticks of lengths (N,)."""
+    def __call__(self, points: Array, lengths_m: Array, seed: int = 0) -> StickMotion:
+        """The motion by points (N, T, P, 3), with sticks of lengths (N,); ``seed`` as of a smoother."""
         ends = points[:, :, list(self.ends)]
-        middle, velocity = self.middle(ends.mean(2, keepdims=True))
-        direction, rate = from_sphere(self.base, *self.direction(_direction(ends)[:, :, None]))
+        middle, velocity = self.middle(ends.mean(2, keepdims=True), (seed, 2))
+        direction, rate = from_sphere(self.base, *self.direction(_direction(ends)[:, :, None], (seed, 3)))
         half = 0.5 * lengths_m[:, None, None, None]
         parts = middle - half * direction, middle + half * direction, velocity - half * rate, velocity + half * rate
         start, tip, start_velocity, tip_velocity = (part[:, :, 0] for part in parts)

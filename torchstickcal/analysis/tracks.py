@@ -17,13 +17,19 @@ from torch import Tensor
 from torchstickcal.errors import CalibrationError
 from torchstickcal.geometry import se3
 from torchstickcal.geometry.cameras import Intrinsics
+from torchstickcal.reconstruction import Reconstruction
 from torchstickcal.result import Calibration
 from torchstickcal.solvers.uncertainty import triangulation_terms
+from torchstickcal.world import World
 
 Array = NDArray[np.float64]
 
 _LEVEL_SINE = 0.09
 """Sine of 5 degrees: cameras that are tilted to the side by more than this in the mean are not level."""
+
+
+_MEASURED = ("points", "calibration")
+"""Frames whose z axis comes from measurements."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,7 +43,7 @@ class Tracks:
     times: Array
     """(T,), seconds, ascending"""
     points: Array
-    """(T, P, 3), metres, in the frame of the first camera; NaN where not known"""
+    """(T, P, 3), metres, in the frame of the calibration; NaN where not known"""
     roots: Array
     """(T, P, 3, 3), square roots of the covariances that the keypoints' noise gives, metres"""
     by_cameras: Array
@@ -69,14 +75,14 @@ class Tracks:
         return np.square(self.roots).sum((-2, -1)) / 3
 
 
-def tracks_of(calibration: Calibration, fps: float | None = None, up: Sequence[float] | None = None) -> Tracks:
-    """The tracks of a calibrated session.
+def tracks_of(calibration: Calibration | Reconstruction, fps: float | None = None, up: Sequence[float] | None = None) -> Tracks:
+    """The tracks of a calibrated session, or of a recording that was triangulated.
 
     Args:
-        calibration: of the session.
+        calibration: of the session; or what :func:`torchstickcal.triangulate` found.
         fps: frames per second; None for those of the calibration.
-        up: the vertical in the frame of the first camera, of any length; None to take it from the cameras, which then must
-            stand level: not tilted to the side, as on a tripod.
+        up: the vertical in the frame of the calibration, of any length; None to take it from the cameras, which then must
+            stand level: not tilted to the side, as on a tripod; or from the frame, if its z is up.
 
     Raises:
         CalibrationError: if neither the calibration nor ``fps`` says how fast the frames follow each other, or ``up`` has no
@@ -91,7 +97,7 @@ def tracks_of(calibration: Calibration, fps: float | None = None, up: Sequence[f
         ((30, 21, 3), (3,))
     """
     points, covariances, by_cameras = _frame_by_frame(calibration)
-    vertical, notes = _vertical(calibration.rotations.double(), up)
+    vertical, notes = _vertical(calibration.rotations.double(), calibration.world, up)
     return Tracks(
         times=_times(calibration, fps),
         points=points.numpy(),
@@ -105,7 +111,7 @@ def tracks_of(calibration: Calibration, fps: float | None = None, up: Sequence[f
     )
 
 
-def _frame_by_frame(calibration: Calibration) -> tuple[Tensor, Tensor, Tensor]:
+def _frame_by_frame(calibration: Calibration | Reconstruction) -> tuple[Tensor, Tensor, Tensor]:
     """Points (G, P, 3) of each frame by itself, covariances (G, P, 3, 3) and derivatives (G, P, 3, K), on the CPU.
 
     The calibration's points fit their keypoints up to the residuals; one step of Gauss-Newton undoes the smoothing.
@@ -131,7 +137,7 @@ def _frame_by_frame(calibration: Calibration) -> tuple[Tensor, Tensor, Tensor]:
     return points + step, covariances, by_cameras
 
 
-def _times(calibration: Calibration, fps: float | None) -> Array:
+def _times(calibration: Calibration | Reconstruction, fps: float | None) -> Array:
     if fps is None and calibration.times is not None:
         return calibration.times.double().cpu().numpy()
     rate = fps or calibration.fps
@@ -146,10 +152,11 @@ def _times(calibration: Calibration, fps: float | None) -> Array:
     return np.arange(len(calibration.points)) / rate
 
 
-def _vertical(rotations: Tensor, up: Sequence[float] | None) -> tuple[Array | None, list[str]]:
+def _vertical(rotations: Tensor, world: World, up: Sequence[float] | None) -> tuple[Array | None, list[str]]:
     """The vertical (3,) and a sentence about where it comes from.
 
-    The x axis of a level camera is horizontal: the vertical is what is most nearly perpendicular to all of them.
+    The x axis of a level camera is horizontal: the vertical is what is most nearly perpendicular to all of them. A frame by
+    measured points is better than that; one by the posture of the athlete is not.
     """
     if up is not None:
         given = np.asarray(up, dtype=np.float64)
@@ -157,12 +164,17 @@ def _vertical(rotations: Tensor, up: Sequence[float] | None) -> tuple[Array | No
         if not np.isfinite(length) or length == 0:
             raise CalibrationError("not a direction", where="up", got=up, expected="three numbers, not all of them 0")
         return given / length, []
+    of_frame = np.array([0.0, 0.0, 1.0]), [f"The vertical is the z axis of the frame: {world.axes}."]
+    if world.up == "z" and world.name in _MEASURED:
+        return of_frame
     rotations = rotations.cpu()
     _, values, axes = torch.linalg.svd(rotations[:, 0] / len(rotations) ** 0.5)
     tilt, second = (float(v) for v in (values[2] if len(values) > 2 else 0.0, values[1]))
     candidate = axes[2]
     mean_up = -rotations[:, 1].mean(0)
     if tilt > _LEVEL_SINE or second < 2 * _LEVEL_SINE or abs(float(candidate @ mean_up)) < 0.5:
+        if world.up == "z":
+            return of_frame
         return None, [
             "The vertical is not known, because the cameras do not stand level or look in one direction. Angles that need it "
             "are left out. Give it as `up`."

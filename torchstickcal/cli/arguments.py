@@ -112,8 +112,10 @@ def _add_common(command: argparse.ArgumentParser, default: Any) -> None:
 
 
 def _add_calibrate(commands: Any) -> None:
-    command = commands.add_parser("calibrate", help="calibrate a session", description="Calibrate a session.")
-    _add_session(command)
+    command = commands.add_parser(
+        "calibrate", help="calibrate a session", description="Calibrate a session: keypoints, or videos."
+    )
+    _add_session(command, "a session; or one video for each camera, with --tape, --rtmlib or --weights")
     _add_out(command, "results")
     _add_format(command, "SESSION")
     _add_given(command)
@@ -130,6 +132,7 @@ def _add_calibrate(commands: Any) -> None:
     command.add_argument(
         "--split-moved", action="store_true", help="if a camera moved, calibrate again with its places before and after as two"
     )
+    _add_detectors(command)
     _add_strict(command)
     command.add_argument("--verbose", action="store_true", help="show every table: lenses, clocks, sticks, points, stages")
     _add_plugin(command)
@@ -239,6 +242,12 @@ def _add_triangulate(commands: Any) -> None:
     _add_config(command)
     _add_no_sync(command)
     _add_write(command, "points: trc, c3d, csv, npz (default: npz);")
+    command.add_argument(
+        "--analyse",
+        metavar="SPORT",
+        help="also write joint angles, phases and figures of the swings, as `torchstickcal analyse` does, into `analysis` in "
+        "DIR: golf, baseball, hockey, kendo or any",
+    )
     _add_units(command)
     _add_plugin(command)
     command.set_defaults(run=triangulate_session, configuration=triangulation_config, intrinsics=None)
@@ -269,22 +278,28 @@ def _add_detect(commands: Any) -> None:
     add("videos", metavar="VIDEO", type=_path, nargs="+", help="a video for each camera, called after the camera")
     help = "folder for the keypoints, created if it does not exist; a video that is done is not read again"
     add("--out", metavar="DIR", type=_path, required=True, help=help)
-    add("--weights", metavar="FILE.onnx", type=_path, help="network for the body's keypoints, of the kind of RTMPose")
+    add("--skeleton", metavar="NAME|FILE.toml", help="names of the body's points (default: by their number)")
+    _add_detectors(command)
+    _add_plugin(command)
+    command.set_defaults(run=detect_videos)
+
+
+def _add_detectors(command: argparse.ArgumentParser) -> None:
+    """What is looked for in videos."""
+    add = command.add_argument
+    add("--weights", metavar="FILE.onnx", type=_path, help="videos: network for the body's keypoints, of the kind of RTMPose")
     add(
         "--rtmlib",
         metavar="MODE",
         choices=("lightweight", "balanced", "performance"),
-        help="use RTMLib with its own weights, which it loads when first used: lightweight, balanced or performance",
+        help="videos: use RTMLib with its own weights, which it loads when first used: lightweight, balanced or performance",
     )
-    add("--skeleton", metavar="NAME|FILE.toml", help="names of the body's points (default: by their number)")
     add(
         "--tape",
         metavar="A,B",
-        help="colours of tape or balls on the stick's ends, the end in the hands first: red, orange, yellow, green, cyan, "
-        "blue, magenta; the cameras must stand still",
+        help="videos: colours of tape or balls on the stick's ends, the end in the hands first: red, orange, yellow, green, "
+        "cyan, blue, magenta; the cameras must stand still",
     )
-    _add_plugin(command)
-    command.set_defaults(run=detect_videos)
 
 
 def _add_analyse(commands: Any) -> None:
@@ -304,8 +319,10 @@ def _add_analyse(commands: Any) -> None:
         metavar=("X", "Y", "Z"),
         nargs=3,
         type=float,
-        help="the vertical in the frame of the first camera (default: from the cameras, if they stand level)",
+        help="the vertical in the frame of the results (default: from the cameras, if they stand level, or from the frame)",
     )
+    help = "write the points in these formats too: c3d (with the phases as events), trc, csv, npz"
+    add("--write", metavar="A,B", help=help)
     add("--stick", metavar="N", type=int, default=0, help="which stick, counted from 0 (default: 0)")
     _add_plugin(command)
     command.set_defaults(run=analyse_session)

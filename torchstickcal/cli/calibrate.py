@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from torchstickcal.cli.configuration import calibration_config, made_with
 from torchstickcal.cli.console import note
+from torchstickcal.cli.detect import session_in
 from torchstickcal.cli.outputs import chosen_files, show_results
 from torchstickcal.cli.progress import StagesProgress, progress, weights_of
 from torchstickcal.cli.world import placed, world_of
@@ -35,7 +36,8 @@ def calibrate_session(options: argparse.Namespace) -> int:
     try_writing(options.out, files.single_files)
     if options.tensorboard is not None:
         try_writing(options.tensorboard, where="--tensorboard")
-    session = load_session(options.session, options.format, given_of(options))
+    given = given_of(options)
+    session = load_session(session_in(options.session, options), options.format, given)
     for sentence in session.notes:
         note(sentence)
     observations = with_stick(session.observations, options.stick_length, options.stick_sigma)

@@ -6,6 +6,7 @@ import argparse
 from dataclasses import replace
 from typing import Any
 
+from torchstickcal.cli.analyse import write_analysis
 from torchstickcal.cli.calibrate import given_of
 from torchstickcal.cli.configuration import made_with, triangulation_config
 from torchstickcal.cli.console import note
@@ -47,6 +48,9 @@ def triangulate_session(options: argparse.Namespace) -> int:
         write_json(folder / REPORT_FILE, _provenance(options, list(session.notes)) | summary(found))
     print(table(found))
     print(f"\n{', '.join([*writers, REPORT_FILE])} in {options.out}")
+    if options.analyse is not None:
+        print()
+        write_analysis(found, options.out / "analysis", options.analyse, "c3d" if "points.c3d" in writers else None)
     return EXIT_DONE
 
 

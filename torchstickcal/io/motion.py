@@ -49,6 +49,8 @@ class Motion:
     """(G, P), standard deviations of the points; NaN or None where not known"""
     world: World | None = None
     """the frame; None where a file does not say it"""
+    events: tuple[tuple[str, float], ...] = ()
+    """names and times of events, seconds on the clock of ``times``; formats without events leave them out"""
 
     @staticmethod
     def of(scene: Scene | Motion) -> Motion:

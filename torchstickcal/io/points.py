@@ -6,6 +6,7 @@ import csv
 import io
 import json
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -75,10 +76,23 @@ def write_c3d(path: Path, motion: Motion) -> None:
     file.add_parameter("POINT", "Y_SCREEN", ["-Y" if y_down else "+Z"])
     for key, text in about("millimetres", motion.world).items():
         file.add_parameter("TORCHSTICKCAL", key.upper(), [text])
+    if motion.events:
+        _add_events(file, motion)
     file["data"]["points"] = data
     file["data"]["meta_points"]["residuals"] = np.where(known, _PER_METRE * std, _UNKNOWN_RESIDUAL).T[None]
     with atomic_path(path) as temporary:
         file.write(str(temporary))
+
+
+def _add_events(file: Any, motion: Motion) -> None:
+    """The group EVENT: times are minutes and seconds since the first frame."""
+    first_s = 0.0 if motion.times is None or not len(motion.times) else float(motion.times[0])
+    seconds = np.array([time for _, time in motion.events]) - first_s
+    minutes = np.floor(seconds / 60)
+    file.add_parameter("EVENT", "USED", [len(seconds)])
+    file.add_parameter("EVENT", "CONTEXTS", ["General"] * len(seconds))
+    file.add_parameter("EVENT", "LABELS", [label for label, _ in motion.events])
+    file.add_parameter("EVENT", "TIMES", np.stack([minutes, seconds - 60 * minutes]))
 
 
 @point_writer("csv", "points as a table, in metres (.csv)", file_name="points.csv")

@@ -1,18 +1,22 @@
-"""Plain tables of points (.csv): a row for each point, or DLTdv's and Argus's columns for each point and camera."""
+"""Plain tables of points (.csv): a row for each point, also as `detect` writes them; DLTdv's and Argus's columns."""
 
 from __future__ import annotations
 
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
 from torchstickcal.io.formats import keypoint_reader
 from torchstickcal.io.recording import Recording, View
-from torchstickcal.untrusted import read_rows
+from torchstickcal.untrusted import read_json, read_rows
 
 _LONG = ("camera", "frame", "point", "x", "y")
 _SCORES = ("score", "confidence", "likelihood")
+_DETECTED = ("keypoints.csv", "videos.json")
+_SAME_RATE = 1e-3
+"""Differences of frame rates, as a share, that come from the rounding of times."""
 _WIDE = re.compile(r"(?P<point>.+?)[_ ]cam[_ ]?(?P<camera>\w+?)[_ ](?P<axis>[xy])", re.IGNORECASE)
 
 
@@ -48,6 +52,27 @@ def read_table(path: Path) -> Recording:
             track[place] = [_number(row[column["x"]]), _number(row[column["y"]]), 1.0 if score is None else _number(row[score])]
         views.append(View.of_tracks(camera, track, points, frames=numbers))
     return Recording.of(views)
+
+
+@keypoint_reader(
+    "detected",
+    "a folder that `torchstickcal detect` wrote (keypoints.csv, videos.json)",
+    recognises=lambda path, head: all((path / name).is_file() for name in _DETECTED),
+)
+def read_detected(path: Path) -> Recording:
+    """Read the table of a folder, with image sizes and frame rate of the videos."""
+    table, about = path / _DETECTED[0], read_json(path / _DETECTED[1])
+    recording = read_table(table)
+    views = []
+    for view in recording.views:
+        width, height = about[view.name]["image_size"]
+        views.append(replace(view, image_size=(float(width), float(height))))
+    rates = [float(about[view.name]["fps"]) for view in views]
+    alike = max(rates) - min(rates) <= _SAME_RATE * max(rates)
+    note = f"The videos have different frame rates: {', '.join(f'{rate:g}' for rate in rates)} Hz."
+    return replace(
+        recording, views=tuple(views), fps=float(np.median(rates)) if alike else None, notes=() if alike else (note,)
+    )
 
 
 @keypoint_reader(

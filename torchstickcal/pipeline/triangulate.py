@@ -268,6 +268,8 @@ def _concluded(ended: Adjustment, clocks: _Clocks | None, covariance: Tensor, ru
     period_s = 0.0 if frames.rate_hz is None else 1 / frames.rate_hz
     first_s = 0.0 if observations.readout_s is None else observations.readout_s / 2
 
+    lens = observations.distortion
+
     def as_given(tensor: Tensor) -> Tensor:
         return tensor.to(observations.keypoints.dtype).contiguous()
 
@@ -284,6 +286,12 @@ def _concluded(ended: Adjustment, clocks: _Clocks | None, covariance: Tensor, ru
         times=None if frames.rate_hz is None else frames.numbers.double() * period_s + first_s,
         time_offsets=as_given(offsets * period_s),
         time_offsets_std=as_given(std * period_s),
+        rotations=as_given(ended.state.rotations[0]),
+        translations=as_given(ended.state.translations[0]),
+        intrinsics=as_given(observations.intrinsics.expand(observations.num_cameras, 3, 3)),
+        distortion=lens if lens is None else as_given(lens.expand(observations.num_cameras, -1)),
+        fisheye=observations.fisheye,
+        covariance=covariance,
         sticks=observations.sticks,
         fps=observations.fps,
         point_names=observations.point_names,
