@@ -44,7 +44,7 @@ class InitialiseSettings:
     """
 
     min_common_points: PositiveInt = 20
-    max_points: PositiveInt = 600
+    max_points: PositiveInt = 200
     threshold_px: Positive = 4.0
 
 

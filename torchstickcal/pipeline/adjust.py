@@ -42,6 +42,8 @@ _MOST_ROUNDS = 6
 _LARGE_ERRORS, _CLEARLY_LESS = 0.002, 0.9
 """Root of the lower quartile of the squared residuals, as a fraction of the focal length, from which on a scene may be taken
 for its reverse; and ratio of two such quartiles that says so."""
+_EXACT = 1e-5
+"""Cost tolerance of the stage for this comparison."""
 _MOST_SORTED = 100_003
 _SETTLED = 0.1
 """Relative change of the numbers of keypoints that count as one, below which a stage need not be repeated with new ones."""
@@ -482,12 +484,16 @@ def _on_the_right_side(stages: Sequence[tuple[str, Stage]], ended: Adjustment, r
     large = squared > (_LARGE_ERRORS * ended.measurements.cameras.focal_px.mean(1)).square()
     if not bool(large.any()):
         return ended
-    before = [ended[session] for session in range(ended.seen.sessions)]
-    reversed_ = [
-        replace(one, state=one.state.depth_reversed(one.measurements.active), results=(), records=((),)) for one in before
-    ]
-    others = through(stages, Adjustment.stack(reversed_), run)
-    better = large & (_small_squared_residuals(others) < _CLEARLY_LESS * squared)
+    exact = [(name, replace(stage, cost_tolerance=min(stage.cost_tolerance, _EXACT))) for name, stage in stages]
+
+    def again(state: State) -> Adjustment:
+        return through(exact, replace(ended, state=state, results=(), records=((),) * ended.seen.sessions), run)
+
+    others = again(ended.state.depth_reversed(ended.measurements.active))
+    closer = _small_squared_residuals(others) < squared
+    if not bool((large & closer).any()):
+        return ended
+    better = large & closer & (_small_squared_residuals(others) < _CLEARLY_LESS * _small_squared_residuals(again(ended.state)))
     return ended.replaced(better, others) if bool(better.any()) else ended
 
 
