@@ -29,14 +29,23 @@ def other_persons(views: RayViews) -> Tensor:
     seen = views.weights > 0
     count = seen.sum(-1)
     pairs = list(itertools.combinations(range(len(count)), 2))
-    agreeing = torch.stack(
-        [((views.squared_distances(views.points(list(pair))) < _AGREEING_SIGMAS**2) & seen).sum(-1) for pair in pairs]
-    )  # (pairs, C, n)
+    found = [_agreeing(views, seen, pair) for pair in pairs]
+    agreeing, met, comparable = (torch.stack(of) for of in zip(*found, strict=True))  # (pairs, C, n)
     total = agreeing.sum(1)
-    best = total.argmax(0)
-    share = agreeing.gather(0, best.expand(1, *count.shape))[0] / count.clamp_min(1)
+    best = total.argmax(0).expand(1, *count.shape)
+    share = agreeing.gather(0, best)[0] / count.clamp_min(1)
     athlete = (share >= _ATHLETE_SHARE) & (count >= _MIN_KEYPOINTS)
-    other = (share <= _OTHER_SHARE) & (count >= _MIN_KEYPOINTS) & (athlete.sum(0) >= 2)
+    compared = comparable.gather(0, best)[0]
+    other = (met.gather(0, best)[0] <= _OTHER_SHARE * compared) & (compared >= _MIN_KEYPOINTS) & (athlete.sum(0) >= 2)
     with_camera = torch.tensor([[camera in pair for pair in pairs] for camera in range(len(count))], device=total.device)
     rival = torch.where(with_camera[..., None], total, 0).amax(1)  # (C, n)
     return other & (rival < _CLEAR_RATIO * total.amax(0))
+
+
+def _agreeing(views: RayViews, seen: Tensor, pair: tuple[int, int]) -> tuple[Tensor, Tensor, Tensor]:
+    """How many keypoints of each camera (C, n) agree with the points of a pair; the same of the points in which the rays of the
+    pair meet; and how many keypoints there are of these. Where the rays do not meet, one of them is wrong, not a third camera.
+    """
+    agree = (views.squared_distances(views.points(list(pair))) < _AGREEING_SIGMAS**2) & seen
+    meet = agree[list(pair)].all(0)
+    return agree.sum(-1), (agree & meet).sum(-1), (seen & meet).sum(-1)
