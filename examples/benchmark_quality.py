@@ -515,13 +515,10 @@ def lengths(count: int, seed: int, each: Each) -> None:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else "")
-    for name, help in (
-        ("sound", "sound sessions"),
-        ("bad", "bad sessions"),
-        ("steps", "sessions with a step"),
-        ("lengths", ""),
-    ):
-        parser.add_argument(f"--{name}", type=int, default=0, metavar="N", help=help)
+    parser.add_argument("--sound", type=int, default=0, metavar="N", help="sound sessions")
+    parser.add_argument("--bad", type=int, default=0, metavar="N", help="bad sessions")
+    parser.add_argument("--steps", type=int, default=0, metavar="N", help="sessions with a step")
+    parser.add_argument("--lengths", type=int, default=0, metavar="N", help="sessions whose left-out lengths are looked at")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--jobs", type=int, default=1, metavar="N", help="processes")
     options = parser.parse_args()
