@@ -122,8 +122,9 @@ class ModelSelection:
             others, own_clocks = self._found(clocks)
         except RigError:
             others, own_clocks = [], clocks
-        least = min(map(_median_squared_residual, found))
-        self.start_contradicted = any(_median_squared_residual(other) < _CLEARLY_LESS * least for other in others)
+        least = min((_median_squared_residual(one) for one in found if one.converged), default=math.inf)
+        clearly_less = (_median_squared_residual(other) < _CLEARLY_LESS * least for other in others if other.converged)
+        self.start_contradicted = any(clearly_less)
         if self.start_contradicted:
             return others, own_clocks
         self._start = start
