@@ -30,6 +30,9 @@ whose cameras see one scene. Sound cameras keep 84 % and more, with 20 % of wron
 _NEAR_FOCAL = 0.3
 """Logarithm of an estimated or suggested over the given focal length: from here on, something else is wrong."""
 _FAR_SIGMAS = 8.0
+_MOST_SHARE, _MOST_PLACES, _OUTSIDE = (0.05, 0.95), 20_000, 1.2
+"""Quantiles of the keypoints between which the rest are wrong ones, the number of keypoints that is looked at, and the distance
+from the principal point, over its own from the corner of the image, beyond which there is no image."""
 _OTHER_PERSON_SHARE = 0.2
 """Share of a camera's frames that were set aside as those of another person, from which on the camera itself is doubted."""
 
@@ -125,6 +128,22 @@ class Evidence:
         far = (wanted / focal.given).clamp_min(1e-3).log().abs() > _NEAR_FOCAL
         known = self.observations.intrinsics_known
         return far & (self.contradictions["focal"] > _FAR_SIGMAS**2) if known else torch.zeros_like(far)
+
+    @cached_property
+    def off_centre(self) -> Tensor:
+        """(C,), whether a camera's keypoints lie where the images of its intrinsics do not: all of them above and to the left of
+        the principal point, or many far outside. So they do where the intrinsics are those of another resolution."""
+        observations = self.observations
+        centre = observations.cameras.matrix[:, :2, 2].double()
+        found = torch.zeros(self.cameras, dtype=torch.bool, device=centre.device)
+        for camera in range(self.cameras if observations.intrinsics_known else 0):
+            seen = observations.keypoints[camera][observations.visible[camera]].double()
+            if len(seen):
+                places = seen[:: 1 + len(seen) // _MOST_PLACES] / centre[camera] - 1
+                low, high = places.quantile(_MOST_SHARE[0], dim=0), places.quantile(_MOST_SHARE[1], dim=0)
+                outside = observations.image_size is None and bool((low.abs().maximum(high.abs()) > _OUTSIDE).any())
+                found[camera] = bool((high < 0).all()) or outside
+        return found
 
     @cached_property
     def centres(self) -> Tensor:

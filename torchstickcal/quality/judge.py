@@ -24,7 +24,7 @@ def _judged(evidence: Evidence) -> Quality:
     large = any(finding.is_cause for family, own in found.items() if not family.small for finding in own)
     explained = large or (evidence.consistent and any(finding.is_cause for finding in every))
     doubtful = any(finding.code == "camera_doubtful" for finding in every)
-    if (wrong or doubtful) and not explained:
+    if bool(evidence.off_centre.any()) or ((wrong or doubtful) and not explained):
         causes = [finding for family in FAMILIES.values() if family.tries for finding in _findings(family, evidence)]
         if causes:
             every = [finding for family, own in found.items() if not family.small for finding in own]

@@ -10,13 +10,16 @@ from torchstickcal.metrics import rotation_angle
 from torchstickcal.quality.evidence import Evidence
 from torchstickcal.quality.finding import Finding, Severity
 from torchstickcal.quality.registry import findings
-from torchstickcal.quality.trials import Rest, Sight, hypotheses, moved_within, shifted_share, sight_of, tried, without
+from torchstickcal.quality.resection import Resection
+from torchstickcal.quality.trials import Hypothesis, Rest, Sight, hypotheses, moved_within, shifted_share, sight_of, tried, without
 
 _SOUND_SHARE, _GAIN, _CLEAR_GAIN = 0.6, 0.15, 0.08
 """Share of keypoints that agree in a sound camera, and the least gain of an explanation over none, where that is wrong and
 where it is nearly right."""
-_ALIKE = 0.05
-"""Difference of shares up to which the simpler of two explanations is the one."""
+_ALIKE, _ALIKE_DISTANCE = 0.05, 1.15
+"""Difference of shares, and ratio of distances, up to which the simpler of two explanations is the one."""
+_CLOSER = 0.8
+"""Ratio of distances from which on an explanation with an equal share is better than none."""
 _WHOLE_SHARE = 0.8
 _ALIEN_SHARE = 0.75
 """Share of a camera's keypoints that agree, over that of the others, below which it shows something else."""
@@ -36,8 +39,9 @@ def causes(evidence: Evidence) -> Iterator[Finding]:
         return
     agreement = evidence.agreement * (1 - evidence.ended.labels.other_person[0].double().mean(1))
     order = agreement.argsort().tolist()
-    absurd = evidence.absurd_focals.tolist()
-    suspects = [camera for camera in order if float(agreement[camera]) < _SUSPECT_SHARE or absurd[camera]] or order
+    suspicious = (evidence.absurd_focals | evidence.off_centre).tolist()
+    off_centre = [camera for camera in order if evidence.off_centre[camera]]
+    suspects = off_centre or [c for c in order if float(agreement[c]) < _SUSPECT_SHARE or suspicious[c]] or order
     best: tuple[float, int, Rest] | None = None
     for camera in suspects[:_MOST_SUSPECTS]:
         rest = without(evidence, camera)
@@ -48,7 +52,7 @@ def causes(evidence: Evidence) -> Iterator[Finding]:
     _, camera, rest = best
     worse = float(agreement[camera]) < _BEHIND_OTHERS * rest.share
     noisy = evidence.noise_mrad > _NOISY_MRAD and rest.noise_mrad < _NOISE_RATIO * evidence.noise_mrad
-    if rest.share < _SOUND_SHARE or not (worse or noisy or absurd[camera]):
+    if rest.share < _SOUND_SHARE or not (worse or noisy or suspicious[camera]):
         return
     if (finding := _explained(evidence, camera, rest)) is not None:
         yield finding
@@ -78,11 +82,10 @@ def _explained(evidence: Evidence, camera: int, rest: Rest) -> Finding | None:
             is_cause=True,
         )
 
-    found = [(h, placed[0].share) for h in hypotheses() if (placed := rest.placed(h.changed(sight))) is not None]
-    largest = max((share for _, share in found), default=0.0)
-    hypothesis, share = next((one for one in found if one[1] >= largest - _ALIKE), (None, 0.0))
-    if hypothesis is not None and share > max(_SOUND_SHARE, as_given + (_GAIN if as_given < _SOUND_SHARE else _CLEAR_GAIN)):
-        return cause(hypothesis.code, hypothesis.what, hypothesis.advice, share)
+    found = [(h, placed[0]) for h in hypotheses() if (placed := rest.placed(h.changed(sight))) is not None]
+    if (best := _best(found)) is not None and _explains(best[1], None if plain is None else plain[0]):
+        hypothesis, placed = best
+        return cause(hypothesis.code, hypothesis.what, hypothesis.advice, placed.share)
     if as_given < _WHOLE_SHARE and (moved := moved_within(rest, sight)) is not None:
         finding = _moved(evidence, camera, *moved)
         if finding is not None:
@@ -112,8 +115,25 @@ def _explained(evidence: Evidence, camera: int, rest: Rest) -> Finding | None:
         "its keypoints agree with the other cameras at no place, neither mirrored, turned, scaled nor moved in time: it "
         "shows another person or another recording",
         "Check which person the detector follows in this camera, and whether the video belongs to this session.",
-        max([as_given, *(share for _, share in found)]),
+        max([as_given, *(placed.share for _, placed in found)]),
     )
+
+
+def _best(found: list[tuple[Hypothesis, Resection]]) -> tuple[Hypothesis, Resection] | None:
+    """The explanation by which most keypoints agree; of several that are alike, the one by which they are closest, or simpler."""
+    largest = max((placed.share for _, placed in found), default=0.0)
+    alike = [one for one in found if one[1].share >= largest - _ALIKE]
+    least = min((placed.distance_sigmas for _, placed in alike), default=0.0)
+    return next((one for one in alike if one[1].distance_sigmas <= _ALIKE_DISTANCE * least), None)
+
+
+def _explains(placed: Resection, plain: Resection | None) -> bool:
+    """Whether a camera as it would be by an explanation fits the others clearly better than as given."""
+    if plain is None:
+        return placed.share > _SOUND_SHARE
+    closer = placed.share > plain.share - _ALIKE and placed.distance_sigmas < _CLOSER * plain.distance_sigmas
+    gain = _GAIN if plain.share < _SOUND_SHARE else _CLEAR_GAIN
+    return placed.share > _SOUND_SHARE and (closer or placed.share > plain.share + gain)
 
 
 def _moved(evidence: Evidence, camera: int, frame: int, before: object, after: object) -> Finding | None:

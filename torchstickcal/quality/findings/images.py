@@ -23,6 +23,7 @@ _SAME_PX = 1.0
 def images(evidence: Evidence) -> Iterator[Finding]:
     """Findings about images and intrinsics."""
     yield from _intrinsics(evidence)
+    yield from _off_centre(evidence)
     yield from _same_video(evidence)
 
 
@@ -75,6 +76,21 @@ def _intrinsics(evidence: Evidence) -> Iterator[Finding]:
             limit=_OUTSIDE_SHARE,
             unit="share",
             is_cause=True,
+        )
+
+
+def _off_centre(evidence: Evidence) -> Iterator[Finding]:
+    """Cameras whose keypoints lie where the images of their intrinsics are not."""
+    for camera in evidence.off_centre.nonzero().flatten().tolist():
+        x, y = evidence.observations.cameras.matrix[camera, :2, 2].tolist()
+        name = evidence.camera(camera)
+        yield Finding(
+            "keypoints_off_centre",
+            Severity.CAUTION,
+            f"{name}: its keypoints lie to one side of the principal point of its intrinsics, ({x:.0f}, {y:.0f}), or far from it, "
+            "as where the intrinsics are those of images of another size.",
+            "Check that the detector saw images of the size that the intrinsics are for.",
+            cameras=(name,),
         )
 
 

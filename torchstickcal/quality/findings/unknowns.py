@@ -19,6 +19,8 @@ _WRONG_FOCAL = 0.02
 """Error of a focal length from which on the camera's distance is wrong by 2 %. Biased keypoints alone make 1 to 2 %."""
 _ANOTHER_CAMERA = 0.3
 """Error of a focal length that no calibration of the same camera makes: an estimate that far away is doubted too."""
+_FAR_FOCAL, _FAR_SIGMAS = 0.03, 3.0
+"""Error of a focal length that no careful calibration makes, from which on less evidence is enough."""
 _IN_STEP_FRAMES = 0.15
 _WRONG_FRAMES = 0.5
 """Time offset, in frames, from which on the clocks matter."""
@@ -77,7 +79,9 @@ def _contradicted(evidence: Evidence, unknown: CameraUnknown, parameter: CameraP
     names = ("value", "std") if parameter.refined else ("suggested", "suggested_std")
     first = (parameter.by_component(name)[:, 0].tolist() for name in (*names, "given", "prior_std"))
     for camera, (value, std, given, prior_std) in enumerate(zip(*first, strict=True)):
-        if not abs(value - given) > max(_CONTRADICTED_SIGMAS * std, unknown.noticeable_prior_share * prior_std):
+        unusual = unknown.name == "focal" and not parameter.refined and abs(value - given) > _FAR_FOCAL * abs(given)
+        limit = _FAR_SIGMAS if unusual else _CONTRADICTED_SIGMAS
+        if not abs(value - given) > max(limit * std, unknown.noticeable_prior_share * prior_std):
             continue
         matters = not parameter.refined and _matters(evidence, unknown.name, value - given, given)
         far = parameter.refined and unknown.name == "focal" and abs(value - given) > _ANOTHER_CAMERA * abs(given)
@@ -96,7 +100,7 @@ def _contradicted(evidence: Evidence, unknown: CameraUnknown, parameter: CameraP
             advice,
             cameras=(name,),
             figure=(value - given) / std if std > 0 else None,
-            limit=_CONTRADICTED_SIGMAS,
+            limit=limit,
             unit="standard deviations",
             is_cause=matters and evidence.explains_most(unknown.family),
         )
