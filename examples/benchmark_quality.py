@@ -233,6 +233,7 @@ def wrong_forearm(given: SimulatedSession) -> Observations:
     return replace(given.observations, sticks=[*given.observations.sticks, Stick(elbow, wrist, 1.2 * length)])
 
 
+ALIEN = ("camera_alien", "other_person", "little_in_common")
 MOVED = ("camera_moved", "camera_drifted")
 CLOCK = ("clock_apart", "unsynchronised", "time_offset_contradicted", "time_offset_uncertain")
 LENS = ("focal_contradicted", "intrinsics_other_resolution", "principal_point_off_centre", "intrinsics_turned")
@@ -244,8 +245,8 @@ KINDS: dict[str, Kind] = {
     "all cameras mirrored": Kind(
         lambda s, c, r: replace(s.observations, keypoints=mirrored(s.observations.keypoints, 1920)), ("scene_mirrored",)
     ),
-    "another person": Kind(lambda s, c, r: another(s, c, r, False), ("camera_alien", "other_person")),
-    "another recording": Kind(lambda s, c, r: another(s, c, r, True), ("camera_alien", "other_person")),
+    "another person": Kind(lambda s, c, r: another(s, c, r, False), ALIEN),
+    "another recording": Kind(lambda s, c, r: another(s, c, r, True), ALIEN),
     "one camera's intrinsics of half resolution": Kind(
         lambda s, c, r: without_size(with_matrix(s.observations, [c], scaled(0.5))), LENS
     ),

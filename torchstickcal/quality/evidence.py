@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -33,6 +33,12 @@ _FAR_SIGMAS = 8.0
 _MOST_SHARE, _MOST_PLACES, _OUTSIDE = (0.05, 0.95), 20_000, 1.2
 """Quantiles of the keypoints between which the rest are wrong ones, the number of keypoints that is looked at, and the distance
 from the principal point, over its own from the corner of the image, beyond which there is no image."""
+_SAID_BY_IMAGES = 2.0
+"""Factor of the evidence against the clocks where the motion in the images, by itself, speaks against them too."""
+CONSTANT_SIGMAS = 0.5
+"""Errors that are always the same, over the noise, from which on they matter."""
+_LEAST_FRAMES = 20
+"""Frames of a point in a camera from which on it can be told which part of its errors is always the same."""
 _OTHER_PERSON_SHARE = 0.2
 """Share of a camera's frames that were set aside as those of another person, from which on the camera itself is doubted."""
 
@@ -112,6 +118,13 @@ class Evidence:
         return (kept / seen.clamp_min(1)).where(seen > 0, 1.0)
 
     @cached_property
+    def in_common(self) -> Tensor:
+        """(C,), share of each camera's keypoints that another camera sees at the same time; 1 where it has none. Of a camera that
+        has more than others, as many count."""
+        seen, compared = self.observations.visible.flatten(1).sum(1).double(), self.measurements.visible[0].sum(-1)
+        return (compared / seen.minimum(seen.median()).clamp_min(1)).clamp_max(1.0).where(seen > 0, 1.0)
+
+    @cached_property
     def consistent(self) -> bool:
         """Whether all cameras agree with each other as those of one scene do, so that linearising tells small errors."""
         least, median = float(self.agreement.min()), float(self.agreement.median())
@@ -184,11 +197,30 @@ class Evidence:
         return self.measurements.by_frame(self.state.points[0].where(known, torch.nan))
 
     @cached_property
+    def constant_errors_px(self) -> Tensor:
+        """(C, 2, P), mean residual of each point in each camera, pixels; 0 where it is seen in too few frames to tell."""
+        m = self.kept
+        sums = torch.zeros(self.cameras, 2, m.points_per_frame, dtype=torch.float64, device=m.pixels.device)
+        for columns, found, _ in m.residuals(self.state):
+            seen = m.visible[0][:, None, columns]
+            sums += found[0].double().where(seen, 0.0).unflatten(-1, (-1, m.points_per_frame)).sum(-2)
+        count = m.by_frame(m.visible[0]).sum(1)[:, None]
+        return (sums / count.clamp_min(1)).where(count >= _LEAST_FRAMES, 0.0)
+
+    @cached_property
+    def constant_errors_sigmas(self) -> float:
+        """Root mean square of the errors that are always the same, over the noise; 0 where that cannot be told."""
+        told = self.constant_errors_px != 0
+        return float((self.constant_errors_px / self.sigma_px)[told].square().mean().sqrt()) if bool(told.any()) else 0.0
+
+    @cached_property
     def motion(self) -> Motion | None:
         """The most evident change of a camera's pose during the session; None where nothing can be said."""
         if self.cameras < 2 or not bool(self.kept.active.any()):
             return None
-        pulls = FramePulls.of(self.measurements, self.state, self.ended.last.sigma_px)
+        m = self.measurements
+        varying = replace(m, pixels=m.pixels + self.constant_errors_px.to(m.pixels).repeat(1, 1, m.frames))
+        pulls = FramePulls.of(varying, self.state, self.ended.last.sigma_px)
         return motion_of(pulls, self.state.rotations[0], self.state.translations[0])
 
     @cached_property
@@ -213,6 +245,8 @@ class Evidence:
             family = all_unknowns()[unknown].family
             if not self.unknowns[unknown].refined:
                 strengths[family] = max(strengths[family], float(squared.max()))
+        if self.unsynchronised():
+            strengths["clock"] *= _SAID_BY_IMAGES
         return strengths[name] >= max(strengths.values())
 
     @cached_property

@@ -23,12 +23,18 @@ _CLOSER = 0.8
 _WHOLE_SHARE = 0.8
 _ALIEN_SHARE = 0.75
 """Share of a camera's keypoints that agree, over that of the others, below which it shows something else."""
+_IN_TIME_SHARE = 0.85
+"""The same at another time, from which on the camera shows the same thing then: others do similar things at other times."""
 _FARTHEST_DEG, _FARTHEST_SHARE = 45.0, 0.3
 """Largest change of a camera that is a motion of it, the shift as a share of the rig; beyond, it shows something else."""
 _MOST_SUSPECTS = 4
 _BEHIND_OTHERS = 0.75
 _SUSPECT_SHARE = 0.8
-_NOISE_RATIO, _NOISY_MRAD = 0.6, 8.0
+_NOISE_RATIO, _NOISY_MRAD = 0.6, 2.0
+"""Noise without a camera, over that with it, from which on the camera contradicts the others however many keypoints agree, and
+the noise above which that is looked at."""
+_NEAR_SIGMAS = 4.0
+"""Median distance of a camera's keypoints from the points of the others, in noise, within which an explanation is one."""
 
 
 @findings("causes", "why a camera contradicts the others, by trial", tries=True)
@@ -54,7 +60,7 @@ def causes(evidence: Evidence) -> Iterator[Finding]:
     noisy = evidence.noise_mrad > _NOISY_MRAD and rest.noise_mrad < _NOISE_RATIO * evidence.noise_mrad
     if rest.share < _SOUND_SHARE or not (worse or noisy or suspicious[camera]):
         return
-    if (finding := _explained(evidence, camera, rest)) is not None:
+    if (finding := _explained(evidence, camera, rest, 0.0 if noisy else float(evidence.agreement[camera]))) is not None:
         yield finding
 
 
@@ -62,8 +68,15 @@ def _soundness(rest: Rest) -> float:
     return rest.share - 0.02 * rest.noise_mrad
 
 
-def _explained(evidence: Evidence, camera: int, rest: Rest) -> Finding | None:
-    """What is wrong with the camera without which the others agree; None if nothing is."""
+def _explained(evidence: Evidence, camera: int, rest: Rest, agreement: float) -> Finding | None:
+    """What is wrong with the camera without which the others agree; None if nothing is.
+
+    Args:
+        evidence: of the session.
+        camera: which.
+        rest: the others.
+        agreement: share of the camera's keypoints that agree in the result; 0 where its noise is so large that this says nothing.
+    """
     sight, name = sight_of(evidence, camera), evidence.camera(camera)
     plain = rest.placed(sight)
     as_given = 0.0 if plain is None else plain[0].share
@@ -91,7 +104,7 @@ def _explained(evidence: Evidence, camera: int, rest: Rest) -> Finding | None:
         if finding is not None:
             return finding
     if as_given > _SOUND_SHARE:
-        if as_given < float(evidence.agreement[camera]) + _CLEAR_GAIN:
+        if as_given < agreement + _CLEAR_GAIN:
             return None
         return cause(
             "camera_misplaced",
@@ -100,7 +113,7 @@ def _explained(evidence: Evidence, camera: int, rest: Rest) -> Finding | None:
             as_given,
         )
     later, share = shifted_share(rest, sight, evidence.ended.frames[0].rate_hz)
-    if later and share > _SOUND_SHARE and share > as_given + _GAIN:
+    if later and share > max(_SOUND_SHARE, _IN_TIME_SHARE * rest.share, as_given + _GAIN):
         word = "later" if later > 0 else "earlier"
         return cause(
             "clock_apart",
@@ -108,7 +121,7 @@ def _explained(evidence: Evidence, camera: int, rest: Rest) -> Finding | None:
             "Estimate the time offsets (refine 'time_offset'), or cut its video to begin with the others.",
             share,
         )
-    if float(evidence.agreement[camera]) > _ALIEN_SHARE * rest.share:
+    if agreement > _ALIEN_SHARE * rest.share:
         return None
     return cause(
         "camera_alien",
@@ -129,11 +142,11 @@ def _best(found: list[tuple[Hypothesis, Resection]]) -> tuple[Hypothesis, Resect
 
 def _explains(placed: Resection, plain: Resection | None) -> bool:
     """Whether a camera as it would be by an explanation fits the others clearly better than as given."""
-    if plain is None:
-        return placed.share > _SOUND_SHARE
+    if placed.share < _SOUND_SHARE or placed.distance_sigmas > _NEAR_SIGMAS or plain is None:
+        return placed.share > _SOUND_SHARE and placed.distance_sigmas < _NEAR_SIGMAS
     closer = placed.share > plain.share - _ALIKE and placed.distance_sigmas < _CLOSER * plain.distance_sigmas
     gain = _GAIN if plain.share < _SOUND_SHARE else _CLEAR_GAIN
-    return placed.share > _SOUND_SHARE and (closer or placed.share > plain.share + gain)
+    return closer or placed.share > plain.share + gain
 
 
 def _moved(evidence: Evidence, camera: int, frame: int, before: object, after: object) -> Finding | None:
