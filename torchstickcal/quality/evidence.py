@@ -27,6 +27,8 @@ from torchstickcal.solvers.uncertainty import centre_covariances, relative_scale
 _CONSISTENT_SHARE, _BEHIND_OTHERS, _NOISY_MRAD = 0.62, 0.85, 10.0
 """Least share of a camera's keypoints that agree, also over that of the median camera, and noise of the keypoints, of a rig
 whose cameras see one scene. Sound cameras keep 84 % and more, with 20 % of wrong keypoints 66 %."""
+DOUBTFUL_SHARE = 0.78
+"""Share of a camera's keypoints that agree, below which it is doubted where the other cameras have more."""
 _NEAR_FOCAL = 0.3
 """Logarithm of an estimated or suggested over the given focal length: from here on, something else is wrong."""
 _FAR_SIGMAS = 8.0
@@ -113,14 +115,21 @@ class Evidence:
 
     @cached_property
     def agreement(self) -> Tensor:
-        """(C,), share of each camera's keypoints that agree with the other cameras; 1 where it has none."""
-        seen, kept = (m.visible[0].sum(-1).double() for m in (self.measurements, self.kept))
+        """(C,), share of each camera's keypoints that agree with the other cameras; 1 where it has none. Those at exactly
+        (0, 0), with which some detectors mark missing ones, do not count."""
+        at_corner = (self.ended.seen.pixels[0] == 0).all(1)
+        seen, kept = ((m.visible[0] & ~at_corner).sum(-1).double() for m in (self.measurements, self.kept))
         return (kept / seen.clamp_min(1)).where(seen > 0, 1.0)
 
     @cached_property
+    def doubtful(self) -> Tensor:
+        """(C,), whether clearly fewer keypoints of a camera agree than of the others."""
+        return (self.agreement < DOUBTFUL_SHARE) & (self.agreement < _BEHIND_OTHERS * self.agreement.median())
+
+    @cached_property
     def in_common(self) -> Tensor:
-        """(C,), share of each camera's keypoints that another camera sees at the same time; 1 where it has none. Of a camera that
-        has more than others, as many count."""
+        """(C,), share of each camera's keypoints that another camera sees at the same time; 1 where it has none. Of a camera
+        that has more than others, as many count."""
         seen, compared = self.observations.visible.flatten(1).sum(1).double(), self.measurements.visible[0].sum(-1)
         return (compared / seen.minimum(seen.median()).clamp_min(1)).clamp_max(1.0).where(seen > 0, 1.0)
 
@@ -144,8 +153,8 @@ class Evidence:
 
     @cached_property
     def off_centre(self) -> Tensor:
-        """(C,), whether a camera's keypoints lie where the images of its intrinsics do not: all of them above and to the left of
-        the principal point, or many far outside. So they do where the intrinsics are those of another resolution."""
+        """(C,), whether a camera's keypoints lie where the images of its intrinsics do not: all of them above and to the left
+        of the principal point, or many far outside. So they do where the intrinsics are those of another resolution."""
         observations = self.observations
         centre = observations.cameras.matrix[:, :2, 2].double()
         found = torch.zeros(self.cameras, dtype=torch.bool, device=centre.device)

@@ -13,8 +13,8 @@ from torchstickcal.quality.verdict import Acceptance, Quality
 from torchstickcal.workers import on_worker
 
 _NOISY_MRAD = 5.0
-"""Noise of the keypoints above which causes are tried even where another was found: good detectors have 1 to 4. So they are where
-several things are wrong, which may have one cause."""
+"""Noise of the keypoints above which causes are tried even where another was found: good detectors have 1 to 4. So they are
+where several things are wrong, which may have one cause."""
 
 
 def judged(evidence: Evidence) -> Quality:

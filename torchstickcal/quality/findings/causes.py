@@ -11,7 +11,17 @@ from torchstickcal.quality.evidence import Evidence
 from torchstickcal.quality.finding import Finding, Severity
 from torchstickcal.quality.registry import findings
 from torchstickcal.quality.resection import Resection
-from torchstickcal.quality.trials import Hypothesis, Rest, Sight, hypotheses, moved_within, shifted_share, sight_of, tried, without
+from torchstickcal.quality.trials import (
+    Hypothesis,
+    Rest,
+    Sight,
+    hypotheses,
+    moved_within,
+    shifted_share,
+    sight_of,
+    tried,
+    without,
+)
 
 _SOUND_SHARE, _GAIN, _CLEAR_GAIN = 0.6, 0.15, 0.08
 """Share of keypoints that agree in a sound camera, and the least gain of an explanation over none, where that is wrong and
@@ -56,7 +66,7 @@ def causes(evidence: Evidence) -> Iterator[Finding]:
     if best is None:
         return
     _, camera, rest = best
-    worse = float(agreement[camera]) < _BEHIND_OTHERS * rest.share
+    worse = bool(evidence.doubtful[camera]) or float(agreement[camera]) < _BEHIND_OTHERS * rest.share
     noisy = evidence.noise_mrad > _NOISY_MRAD and rest.noise_mrad < _NOISE_RATIO * evidence.noise_mrad
     if rest.share < _SOUND_SHARE or not (worse or noisy or suspicious[camera]):
         return
@@ -75,7 +85,8 @@ def _explained(evidence: Evidence, camera: int, rest: Rest, agreement: float) ->
         evidence: of the session.
         camera: which.
         rest: the others.
-        agreement: share of the camera's keypoints that agree in the result; 0 where its noise is so large that this says nothing.
+        agreement: share of the camera's keypoints that agree in the result; 0 where its noise is so large that this says
+            nothing.
     """
     sight, name = sight_of(evidence, camera), evidence.camera(camera)
     plain = rest.placed(sight)
@@ -85,7 +96,7 @@ def _explained(evidence: Evidence, camera: int, rest: Rest, agreement: float) ->
         return Finding(
             code,
             Severity.SERIOUS,
-            f"{name}: {what} ({share:.0%} of them; {as_given:.0%} as given).",
+            f"{name}: {what} ({100 * share:.0f} % of them; {100 * as_given:.0f} % as given).",
             advice,
             cameras=(name,),
             frames=frames,
@@ -133,7 +144,7 @@ def _explained(evidence: Evidence, camera: int, rest: Rest, agreement: float) ->
 
 
 def _best(found: list[tuple[Hypothesis, Resection]]) -> tuple[Hypothesis, Resection] | None:
-    """The explanation by which most keypoints agree; of several that are alike, the one by which they are closest, or simpler."""
+    """The explanation by which most keypoints agree; of several that are alike, the closest, or the simplest."""
     largest = max((placed.share for _, placed in found), default=0.0)
     alike = [one for one in found if one[1].share >= largest - _ALIKE]
     least = min((placed.distance_sigmas for _, placed in alike), default=0.0)
@@ -189,7 +200,7 @@ def _of_a_pair(evidence: Evidence) -> Iterator[Finding]:
                 yield Finding(
                     hypothesis.code,
                     Severity.SERIOUS,
-                    f"{name}, or the other camera: {hypothesis.what} ({share:.0%} of them).",
+                    f"{name}, or the other camera: {hypothesis.what} ({100 * share:.0f} % of them).",
                     hypothesis.advice,
                     cameras=(name,),
                     figure=share,

@@ -69,7 +69,7 @@ def _intrinsics(evidence: Evidence) -> Iterator[Finding]:
         yield Finding(
             "keypoints_outside_image",
             Severity.SERIOUS,
-            f"{name}: {float(share[camera]):.0%} of its keypoints lie far outside its images.",
+            f"{name}: {100 * float(share[camera]):.0f} % of its keypoints lie far outside its images.",
             "Check the image size, and the resolution at which the detector ran.",
             cameras=(name,),
             figure=float(share[camera]),
@@ -87,8 +87,8 @@ def _off_centre(evidence: Evidence) -> Iterator[Finding]:
         yield Finding(
             "keypoints_off_centre",
             Severity.CAUTION,
-            f"{name}: its keypoints lie to one side of the principal point of its intrinsics, ({x:.0f}, {y:.0f}), or far from it, "
-            "as where the intrinsics are those of images of another size.",
+            f"{name}: its keypoints lie to one side of the principal point of its intrinsics, ({x:.0f}, {y:.0f}), or far from "
+            "it, as where the intrinsics are those of images of another size.",
             "Check that the detector saw images of the size that the intrinsics are for.",
             cameras=(name,),
         )
