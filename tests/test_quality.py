@@ -80,7 +80,7 @@ def mirrored(keypoints: Tensor) -> Tensor:
         (lambda s: with_camera(s.observations, 2, mirrored), "camera_mirrored"),
         (lambda s: with_camera(s.observations, 0, mirrored), "camera_mirrored"),
         (lambda s: replace(s.observations, keypoints=mirrored(s.observations.keypoints)), "scene_mirrored"),
-        (lambda s: with_camera(replace(s.observations, image_size=None), 1, lambda k: k / 2), "focal_contradicted"),
+        (lambda s: with_camera(replace(s.observations, image_size=None), 1, lambda k: k / 2), "intrinsics_other_resolution"),
         (lambda s: with_camera(s.observations, 3, lambda k: s.observations.keypoints[1]), "same_video"),
         (lambda s: s.observations.with_stick_length(3.28), "athlete_height"),
         (lambda s: replace(s.observations, sticks=[*s.observations.sticks, Stick(0, 1, 0.5)]), "stick_lengths_contradict"),

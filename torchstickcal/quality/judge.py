@@ -23,23 +23,28 @@ def judged(evidence: Evidence) -> Quality:
 
 
 def _judged(evidence: Evidence) -> Quality:
-    first = [family for family in FAMILIES.values() if not family.tries]
-    found = {family: _findings(family, evidence) for family in first}
-    if not evidence.consistent and any(f.is_cause for family, own in found.items() if not family.small for f in own):
-        found = {family: [_as_effect(f) for f in own] if family.small else own for family, own in found.items()}
-    every = [finding for own in found.values() for finding in own]
-    wrong = any(finding.severity >= Severity.SERIOUS for finding in every)
-    large = any(finding.is_cause for family, own in found.items() if not family.small for finding in own)
-    serious = [family for family, own in found.items() if any(f.severity >= Severity.SERIOUS for f in own)]
-    single = evidence.noise_mrad < _NOISY_MRAD and len(serious) < 2
-    explained = single and (large or (evidence.consistent and any(f.is_cause for f in every)))
-    doubtful = any(finding.code == "camera_doubtful" for finding in every)
-    if bool(evidence.off_centre.any()) or ((wrong or doubtful) and not explained):
+    found = {family: _findings(family, evidence) for family in FAMILIES.values() if not family.tries}
+    large = [finding for family, own in found.items() if not family.small for finding in own]
+    small = [finding for family, own in found.items() if family.small for finding in own]
+    if not evidence.consistent and any(finding.is_cause for finding in large):
+        small = [_as_effect(finding) for finding in small]
+    causes: list[Finding] = []
+    if _worth_trying(evidence, found):
         causes = [finding for family in FAMILIES.values() if family.tries for finding in _findings(family, evidence)]
-        if causes:
-            every = [finding for family, own in found.items() if not family.small for finding in own]
-        every = causes + every
-    return Quality.of(every, _acceptance(evidence))
+    return Quality.of([*causes, *large, *([] if causes else small)], _acceptance(evidence))
+
+
+def _worth_trying(evidence: Evidence, found: dict[Family, list[Finding]]) -> bool:
+    """Whether something is wrong, or may be, that no finding explains."""
+    if bool(evidence.off_centre.any()):
+        return True
+    every = [finding for own in found.values() for finding in own]
+    wrong = any(finding.severity >= Severity.SERIOUS or finding.code == "camera_doubtful" for finding in every)
+    explaining = [family for family, own in found.items() if any(finding.is_cause for finding in own)]
+    serious = [family for family, own in found.items() if any(finding.severity >= Severity.SERIOUS for finding in own)]
+    alone = len(serious) < 2 and evidence.noise_mrad < _NOISY_MRAD
+    explained = any(family.direct or (alone and (evidence.consistent or not family.small)) for family in explaining)
+    return wrong and not explained
 
 
 def _as_effect(finding: Finding) -> Finding:

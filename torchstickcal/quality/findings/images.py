@@ -19,7 +19,7 @@ _SAME_PX = 1.0
 """Median distance of the keypoints of two cameras below which it is one video. Different cameras have different noise."""
 
 
-@findings("images", "intrinsics of other images, keypoints outside the image, and the same video twice")
+@findings("images", "intrinsics of other images, keypoints outside the image, and the same video twice", direct=True)
 def images(evidence: Evidence) -> Iterator[Finding]:
     """Findings about images and intrinsics."""
     yield from _intrinsics(evidence)

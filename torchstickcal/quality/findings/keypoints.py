@@ -20,7 +20,7 @@ _NOISY_MRAD = 10.0
 """Good detectors have 1 to 4; mirrored or alien cameras raise the noise of all to 10 and more."""
 
 
-@findings("keypoints", "label errors, wrong, unused and noisy keypoints, and values that are no pixels")
+@findings("keypoints", "label errors, wrong, unused and noisy keypoints, and values that are no pixels", direct=True)
 def keypoints(evidence: Evidence) -> Iterator[Finding]:
     """Findings about keypoints."""
     yield from _values(evidence)
