@@ -233,10 +233,11 @@ class CalibrationLayer(nn.Module):
             state = State(*poses, zeros(len(status), 3, data.num_columns), data.unknowns.given)
             sigma_px = zeros(len(status), data.points_per_frame)
             result = LayerResult.of(data, state, data.visible, sigma_px, Labels.as_given(data), status, given.keypoints.dtype)
-            if self.judge:
-                result = result.with_qualities([_not_calibrated(said) for said in status], zeros(*shape))
         no_gradient = given.no_gradient()
-        return result.each(lambda tensor: tensor + no_gradient if tensor.is_floating_point() else tensor)
+        result = result.each(lambda tensor: tensor + no_gradient if tensor.is_floating_point() else tensor)
+        if not self.judge:
+            return result
+        return result.with_qualities([_not_calibrated(said) for said in status], torch.zeros_like(result.time_offsets.detach()))
 
     def _start(self, initial: LayerResult) -> LayerResult:
         """An earlier result to start from, with the batch dimension, without gradients.
