@@ -31,7 +31,7 @@ from torchstickcal.quality.registry import FAMILIES, findings
 from torchstickcal.quality.resection import resected
 from torchstickcal.quality.trials import without
 from torchstickcal.result import CameraParameter
-from torchstickcal.simulate import Noise, SessionSpec, SimulatedSession
+from torchstickcal.simulate import Noise, SessionSpec, SimulatedSession, golf_session
 from torchstickcal.solvers.elimination.normal_equations import NormalEquations
 
 
@@ -120,6 +120,12 @@ def test_missing_keypoints_at_the_corner_do_not_make_a_camera_doubtful():
 def evidence_of(calibration: Calibration) -> Evidence:
     assert isinstance(calibration.judgement, partial)
     return calibration.judgement.args[0]
+
+
+@pytest.mark.parametrize(("cameras", "frames"), [(3, 20), (5, 80)])
+def test_keypoints_without_noise_are_no_motion_of_a_camera(cameras: int, frames: int):
+    quality = calibrate(golf_session(cameras=cameras, frames=frames)[0]).quality
+    assert quality.verdict is Verdict.GOOD
 
 
 @pytest.mark.parametrize("seed", [2, 10])
