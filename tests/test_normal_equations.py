@@ -175,16 +175,18 @@ def test_linearised_cost_and_gradient_agree_with_autograd(disturbed: tuple[Measu
 
 
 @pytest.mark.parametrize("losses", LOSSES.values(), ids=LOSSES.keys())
-@pytest.mark.parametrize("cached", [True, False], ids=["cached", "computed again"])
+@pytest.mark.parametrize("kept", ["rows", "blocks", "nothing"])
 def test_splitting_into_parts_does_not_change_the_step(
-    disturbed: tuple[Measurements, State], losses: dict[str, Loss], cached: bool, monkeypatch: pytest.MonkeyPatch
+    disturbed: tuple[Measurements, State], losses: dict[str, Loss], kept: str, monkeypatch: pytest.MonkeyPatch
 ):
     measurements, state = disturbed
     objective = Objective(measurements, losses)
     whole = NormalEquations(objective, state, True, 1e-3).step()
     monkeypatch.setattr("torchstickcal.model.measurements._CHUNK_KEYPOINTS", {"cpu": 200})
     monkeypatch.setattr("torchstickcal.solvers.elimination.parts._MAX_TRACK_POINTS", 90)
-    if not cached:
+    if kept != "rows":
+        monkeypatch.setattr("torchstickcal.solvers.elimination.normal_equations._MAX_SOLVED_BYTES", 0)
+    if kept == "nothing":
         monkeypatch.setattr("torchstickcal.solvers.elimination.normal_equations._MAX_CACHED_BYTES", 0)
     assert len(measurements.chunks()) > 10
     parts = NormalEquations(objective, state, True, 1e-3).step()

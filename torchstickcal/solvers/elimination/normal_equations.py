@@ -35,13 +35,15 @@ from torchstickcal.model.state import State
 from torchstickcal.model.unknowns import Columns, RigUnknowns
 from torchstickcal.solvers.base import IterationRecord
 from torchstickcal.solvers.elimination.camera_sums import CameraSums
-from torchstickcal.solvers.elimination.cross_blocks import cross_rows, symmetric_times
+from torchstickcal.solvers.elimination.cross_blocks import symmetric_times
 from torchstickcal.solvers.elimination.parts import BetweenFrames, Couplings, Part, WithinFrame, parts
 from torchstickcal.solvers.elimination.points import PointElimination
 from torchstickcal.solvers.elimination.tracks import TrackElimination
 
 _MAX_CACHED_BYTES = 2**28
 """Memory up to which the blocks N_c are cached for the back-substitution."""
+_MAX_SOLVED_BYTES = 2**24
+"""Memory up to which the rows W^T are cached in their place. They save work, as long as they fit into the processor's cache."""
 
 
 class Step(NamedTuple):
@@ -79,13 +81,22 @@ class _EliminatedPart(NamedTuple):
 
     coupling: _CameraCoupling
     elimination: PointElimination | TrackElimination
+    rows: Tensor | None = None
+    """``W^T = (L^-1 H_xc)^T``, where it is kept"""
 
-    def forward_solve_cross(self, points: Tensor, gradient: Tensor) -> tuple[Tensor, Tensor]:
-        """``(L^-1 H_xc)^T`` and ``L^-1 g``, for points and a gradient (B, 3, n)."""
-        camera_blocks, camera_gradients, unknown_blocks = self.coupling
-        return self.elimination.forward_solve_cross(camera_blocks, points, gradient, camera_gradients, unknown_blocks)
+    def solved_rows(self, points: Tensor) -> Tensor:
+        """``W^T = (L^-1 H_xc)^T`` (B, 6 C' + K, 3 n), for points (B, 3, n)."""
+        return self.elimination.forward_solve_cross(*self.coupling, points) if self.rows is None else self.rows
 
-    def cross_product(self, points: Tensor, camera_step: Tensor, unknown_step: Tensor) -> Tensor:
+    def back_substituted(self, rhs: Tensor, points: Tensor, camera_step: Tensor, unknown_step: Tensor) -> Tensor:
+        """``H_xx^-1 (b - H_xc s)`` (B, 3, n), for a right-hand side b (B, 3, n) and a step s of cameras and unknowns."""
+        if self.rows is None:
+            return self.elimination.solve(rhs - self._cross_product(points, camera_step, unknown_step))
+        step = torch.cat([camera_step.flatten(1), unknown_step], dim=1).to(rhs.dtype)
+        forward = self.elimination.forward_solve(rhs)
+        return self.elimination.backward_solve(torch.baddbmm(forward[:, None], step[:, None], self.rows, alpha=-1)[:, 0])
+
+    def _cross_product(self, points: Tensor, camera_step: Tensor, unknown_step: Tensor) -> Tensor:
         """``H_xc`` times a step of the cameras, (B, C', 6), and of the lens and clock unknowns, (B, K): (B, 3, n)."""
         camera_blocks, camera_gradients, unknown_blocks = self.coupling
         rotation = se3.hat(camera_step[..., 3:])
@@ -166,11 +177,10 @@ class NormalEquations:
         descent = -(rig_gradient * rig_step).sum(1)
         squared = (self._rig_diagonal * rig_step.square()).sum(1)
         for part, eliminated in self._eliminated_parts():
-            rhs = gradient[..., part.columns]
-            cross = eliminated.cross_product(self.state.points[..., part.columns], camera_step, unknown_step)
-            solved = eliminated.elimination.solve(rhs + cross).neg_()
+            rhs = -gradient[..., part.columns]
+            solved = eliminated.back_substituted(rhs, self.state.points[..., part.columns], camera_step, unknown_step)
             point_step[..., part.columns] = solved
-            descent -= (rhs * solved).sum((1, 2), dtype=torch.float64)
+            descent += (rhs * solved).sum((1, 2), dtype=torch.float64)
             squared += (hessian[..., part.columns][:, DIAGONAL] * solved.square()).sum((1, 2), dtype=torch.float64)
         damped = squared * self._damping
         squared_sigmas = -(self.reduced_gradient * rig_step).sum(1)
@@ -198,15 +208,15 @@ class NormalEquations:
         point_rhs = point_rhs.to(self.point_hessian.dtype)
         reduced_rhs = torch.cat([camera_rhs.flatten(1), unknown_rhs], dim=1)
         for part, eliminated in self._eliminated_parts() if self._free_cameras else ():
-            rows, solved = eliminated.forward_solve_cross(self._points(part.columns), point_rhs[..., part.columns])
-            reduced_rhs = reduced_rhs - (rows @ solved[..., None])[..., 0]
+            solved = eliminated.elimination.forward_solve(point_rhs[..., part.columns])
+            reduced_rhs = reduced_rhs - (eliminated.solved_rows(self._points(part.columns)) @ solved[..., None])[..., 0]
         factor, failed = torch.linalg.cholesky_ex(self.reduced)
         rig = torch.cholesky_solve(reduced_rhs[..., None], factor)[..., 0]
         cameras, unknowns = self._split(rig)
         points = torch.empty_like(point_rhs)
         for part, eliminated in self._eliminated_parts():
-            cross = eliminated.cross_product(self.state.points[..., part.columns], cameras, unknowns)
-            points[..., part.columns] = eliminated.elimination.solve(point_rhs[..., part.columns] - cross)
+            own = point_rhs[..., part.columns], self.state.points[..., part.columns]
+            points[..., part.columns] = eliminated.back_substituted(*own, cameras, unknowns)
         finite = rig.isfinite().all(1) & points.flatten(1).isfinite().all(1)
         return cameras, unknowns, points, (failed == 0) & finite
 
@@ -224,13 +234,10 @@ class NormalEquations:
         """``-H_xx^-1 H_xc``: movement of the points per unit step of the cameras, (B, 6 C' + K, 3, N)."""
         points = self.state.points
         response = points.new_empty(len(points), self.reduced.shape[1], *points.shape[1:])
-        for part in self._parts:
-            (camera_blocks, _, unknown_blocks), elimination = self._eliminate(part)
-            rows = cross_rows(camera_blocks, self._points(part.columns)).flatten(1, 2)
-            if unknown_blocks is not None:
-                rows = torch.cat([rows, unknown_blocks], dim=1)
+        for part, eliminated in self._eliminated_parts():
+            rows = eliminated.solved_rows(self._points(part.columns))
             for row in range(rows.shape[1]):
-                response[:, row][..., part.columns] = -elimination.solve(rows[:, row]).to(response)
+                response[:, row][..., part.columns] = -eliminated.elimination.backward_solve(rows[:, row]).to(response)
         return response
 
     def records(self, stage: str, iterations: list[int], dampings: list[float], steps_m: list[float]) -> list[IterationRecord]:
@@ -305,7 +312,9 @@ class NormalEquations:
         squares, weights = zeros(m.sessions, m.num_cameras), zeros(m.sessions, m.num_cameras)
         reduced, reduced_gradient = zeros(m.sessions, size, size), zeros(m.sessions, size)
         sums = CameraSums(self.state.points, m.num_cameras, free, self._unknowns.components)
-        if (2 * free + self._unknowns.count) * m.sessions * m.num_columns * 3 * m.pixels.element_size() <= _MAX_CACHED_BYTES:
+        bytes_per_row = 3 * m.sessions * m.num_columns * m.pixels.element_size()
+        keeps_rows = size * bytes_per_row <= _MAX_SOLVED_BYTES
+        if keeps_rows or (2 * free + self._unknowns.count) * bytes_per_row <= _MAX_CACHED_BYTES:
             self._cache = []
         for part in self._parts:
             chunks: list[_CameraCoupling] = []
@@ -323,13 +332,12 @@ class NormalEquations:
                     chunks.append(self._camera_coupling(gradient, hessian, unknown))
             if free:
                 eliminated = self._eliminate(part, chunks)
-                rows, solved = eliminated.forward_solve_cross(
-                    self._points(part.columns), self.point_gradient[..., part.columns]
-                )
+                rows = eliminated.solved_rows(self._points(part.columns))
+                solved = eliminated.elimination.forward_solve(self.point_gradient[..., part.columns])
                 reduced -= rows @ rows.mT
                 reduced_gradient -= (rows @ solved[..., None])[..., 0]
                 if self._cache is not None:
-                    self._cache.append(eliminated)
+                    self._cache.append(eliminated._replace(rows=rows) if keeps_rows else eliminated)
         rig_hessian = self._rig_hessian(sums)
         self._rig_diagonal = rig_hessian.diagonal(dim1=1, dim2=2).clone()
         rig_hessian.diagonal(dim1=1, dim2=2).mul_(1 + self._damping[:, None])

@@ -38,6 +38,8 @@ class BlockTridiagonal:
 
     def __init__(self, diagonal: Tensor, below: Tensor) -> None:
         self._levels: list[_Level] = []
+        self.counts: list[int] = []
+        """the number of blocks eliminated at each level"""
         while diagonal.shape[-3] > 1:
             inverse = _inverse_factor(diagonal[..., 1::2, :, :])
             to_right = below[..., 1::2, :, :].mT
@@ -48,6 +50,8 @@ class BlockTridiagonal:
             diagonal[..., 1 : 1 + right.shape[-3], :, :] -= right.mT @ right
             below = -right.mT @ left[..., : right.shape[-3], :, :]
             self._levels.append(_Level(inverse, left, right))
+            self.counts.append(inverse.shape[-3])
+        self.counts.append(1)
         self._last = _inverse_factor(diagonal)
 
     def forward_solve(self, rhs: Tensor) -> list[Tensor]:
@@ -109,14 +113,32 @@ class TrackElimination:
         couplings = (factors.transpose(1, 2).flatten(0, 1).repeat_interleave(3, -1) for factors in between)
         self._factor = BlockTridiagonal(*_two_frames_per_block(by_track, *couplings))
 
+    def forward_solve(self, rhs: Tensor) -> Tensor:
+        """``L^-1 b`` for right-hand sides b, (B, 3, n): (B, 3 n'), in the order of elimination, with n' >= n."""
+        return self._forward_solve(rhs[:, None])[:, 0]
+
+    def backward_solve(self, solved: Tensor) -> Tensor:
+        """``L^-T y`` (B, 3, n) for y as :meth:`forward_solve` returns it."""
+        tracks, frames, points = self._shape
+        sizes = [tracks * count * 6 * points for count in self._factor.counts]
+        levels = [
+            level.reshape(len(solved) * tracks, count, 6 * points, 1)
+            for level, count in zip(solved.split(sizes, dim=1), self._factor.counts, strict=True)
+        ]
+        by_frame = self._factor.backward_solve(levels).reshape(len(solved), tracks, -1, points, 3)[:, :, :frames]
+        return by_frame.permute(0, 4, 1, 2, 3).flatten(2)
+
+    def solve(self, rhs: Tensor) -> Tensor:
+        """``H^-1 b`` for right-hand sides b, (B, 3, n)."""
+        return self.backward_solve(self.forward_solve(rhs))
+
     def forward_solve_cross(
         self,
         camera_blocks: Tensor,
+        camera_gradients: Tensor | None,
+        unknown_blocks: Tensor | None,
         points: Tensor,
-        gradient: Tensor,
-        camera_gradients: Tensor | None = None,
-        unknown_blocks: Tensor | None = None,
-    ) -> tuple[Tensor, Tensor]:
+    ) -> Tensor:
         """As :meth:`PointElimination.forward_solve_cross`, but with the columns in the order of elimination."""
         rows = cross_rows(camera_blocks, points)
         if camera_gradients is not None:
@@ -124,16 +146,12 @@ class TrackElimination:
         rows = rows.flatten(1, 2)
         if unknown_blocks is not None:
             rows = torch.cat([rows, unknown_blocks], dim=1)
-        levels = self._factor.forward_solve(self._blocks(torch.cat([rows, gradient[:, None]], dim=1)))
-        solved = torch.cat([level.unflatten(0, (len(rows), -1)).flatten(1, -2) for level in levels], dim=1).mT
-        return solved[:, :-1], solved[:, -1]
+        return self._forward_solve(rows)
 
-    def solve(self, rhs: Tensor) -> Tensor:
-        """``H^-1 b`` for right-hand sides b, (B, 3, n)."""
-        tracks, frames, points = self._shape
-        solved = self._factor.backward_solve(self._factor.forward_solve(self._blocks(rhs[:, None])))
-        by_frame = solved.reshape(len(rhs), tracks, -1, points, 3)[:, :, :frames]
-        return by_frame.permute(0, 4, 1, 2, 3).flatten(2)
+    def _forward_solve(self, rows: Tensor) -> Tensor:
+        """``L^-1 b`` for k right-hand sides (B, k, 3, n), (B, k, 3 n')."""
+        levels = self._factor.forward_solve(self._blocks(rows))
+        return torch.cat([level.unflatten(0, (len(rows), -1)).flatten(1, -2) for level in levels], dim=1).mT
 
     def _blocks(self, rhs: Tensor) -> Tensor:
         """Right-hand sides (B, k, 3, n) as blocks of two frames, (B T, G, 6 q, k)."""
