@@ -11,6 +11,7 @@ from torch.nn.functional import pad
 from torchstickcal.geometry.symmetric import are_definite
 from torchstickcal.model.objective import Objective
 from torchstickcal.model.state import State
+from torchstickcal.solvers.elimination.evaluated import Gradient
 from torchstickcal.solvers.elimination.normal_equations import NormalEquations
 
 _DAMPINGS = (0.0, 1e-10, 1e-7)
@@ -139,18 +140,5 @@ def tangent_gradient(state: State, gradient: State, cameras_free: bool) -> Tange
 
 def gradient_at(objective: Objective, state: State, cameras_free: bool) -> Tangent:
     """Half the derivative of an objective at a state, without its Hessian."""
-    m, zeros = objective.measurements, state.points.new_zeros
-    with torch.enable_grad():
-        steps = (zeros(*state.translations.shape[:2], 6), torch.zeros_like(state.points), torch.zeros_like(state.unknowns))
-        cameras, points, unknowns = (step.requires_grad_() for step in steps)
-        found = _derivatives(objective.slope_of_scene(state, points, unknowns), cameras, points, unknowns)
-        for columns in m.chunks():
-            slope = objective.slope_of_images(state, cameras, points, unknowns, columns)
-            found = [sum_ + part for sum_, part in zip(found, _derivatives(slope, cameras, points, unknowns), strict=True)]
-    by_cameras, by_points, by_unknowns = found
-    free = slice(1, None) if cameras_free else slice(0, 0)
-    return Tangent(by_cameras[:, free], by_unknowns if cameras_free else by_unknowns[:, :0], by_points)
-
-
-def _derivatives(slope: Tensor, *steps: Tensor) -> list[Tensor]:
-    return list(torch.autograd.grad(slope, steps, allow_unused=True, materialize_grads=True))
+    found = Gradient(objective, state, cameras_free, torch.float64)
+    return Tangent(found.camera_gradient, found.unknown_gradient, found.point_gradient)

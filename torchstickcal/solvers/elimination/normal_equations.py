@@ -30,12 +30,12 @@ from torch import Tensor
 from torchstickcal.geometry import se3
 from torchstickcal.geometry.symmetric import DIAGONAL, IDENTITY, inverse_diagonal, raised
 from torchstickcal.losses.camera_point import CameraPointTerms, UnknownTerms
-from torchstickcal.model.objective import PRIOR, Objective
+from torchstickcal.model.objective import Objective
 from torchstickcal.model.state import State
-from torchstickcal.model.unknowns import Columns, RigUnknowns
-from torchstickcal.solvers.base import IterationRecord
+from torchstickcal.model.unknowns import Columns
 from torchstickcal.solvers.elimination.camera_sums import CameraSums
 from torchstickcal.solvers.elimination.cross_blocks import symmetric_times
+from torchstickcal.solvers.elimination.evaluated import Evaluated
 from torchstickcal.solvers.elimination.parts import BetweenFrames, Couplings, Part, WithinFrame, parts
 from torchstickcal.solvers.elimination.points import PointElimination
 from torchstickcal.solvers.elimination.tracks import TrackElimination
@@ -109,7 +109,7 @@ class _EliminatedPart(NamedTuple):
         return product
 
 
-class NormalEquations:
+class NormalEquations(Evaluated):
     """The Gauss-Newton system of B sessions at a state.
 
     C' is the number of free cameras: all but the first, or none. K is the number of lens and clock unknowns, 0 if the cameras
@@ -125,18 +125,8 @@ class NormalEquations:
             definite except at a minimum.
     """
 
-    terms: dict[str, Tensor]
-    """value of each loss, (B,)"""
-    reprojection_px: Tensor
-    """(B, C), weighted root mean square reprojection error"""
     point_hessian: Tensor
     """(B, 6, N), diagonal blocks of H_xx, without damping"""
-    point_gradient: Tensor
-    """(B, 3, N)"""
-    camera_gradient: Tensor
-    """(B, C', 6)"""
-    unknown_gradient: Tensor
-    """(B, K)"""
     reduced: Tensor
     """(B, 6 C' + K, 6 C' + K), the reduced camera system S"""
     reduced_gradient: Tensor
@@ -150,21 +140,12 @@ class NormalEquations:
         damping: float | Tensor = 0.0,
         exact: bool = False,
     ) -> None:
-        m = objective.measurements
-        self._exact = exact
-        self.objective, self.state = objective, state
-        self._free_cameras = m.num_cameras - 1 if cameras_free else 0
-        self._unknowns = m.unknowns if cameras_free else RigUnknowns.of((), m.cameras)
+        super().__init__(objective, state, cameras_free)
+        m, self._exact = objective.measurements, exact
         self._damping = torch.as_tensor(damping, dtype=torch.float64, device=state.points.device).expand(m.sessions)
-        self.terms = {name: state.points.new_zeros(m.sessions) for name in objective.losses}
         self._parts = parts(m, objective.clusters, self._add_point_losses())
         self._cache: list[_EliminatedPart] | None = None
         self._add_camera_point_losses()
-
-    @property
-    def cost(self) -> Tensor:
-        """The objective's value, (B,)."""
-        return torch.stack(list(self.terms.values())).sum(0)
 
     def step(self) -> Step:
         """The Levenberg-Marquardt step."""
@@ -240,28 +221,6 @@ class NormalEquations:
                 response[:, row][..., part.columns] = -eliminated.elimination.backward_solve(rows[:, row]).to(response)
         return response
 
-    def records(self, stage: str, iterations: list[int], dampings: list[float], steps_m: list[float]) -> list[IterationRecord]:
-        """The record of each session for an iteration that ends at this state."""
-        m = self.objective.measurements
-        terms = {name: value.tolist() for name, value in self.terms.items()}
-        lengths = m.stick_lengths_m(self.state.points).flatten(1).nanmean(1).tolist()
-        return [
-            IterationRecord(
-                session=session,
-                stage=stage,
-                iteration=iterations[session],
-                cost=sum(values[session] for values in terms.values()),
-                terms={name: values[session] for name, values in terms.items()},
-                damping=dampings[session],
-                step_m=steps_m[session],
-                reprojection_px=tuple(pixels),
-                stick_length_m=lengths[session],
-                rotations=self.state.rotations[session],
-                translations=self.state.translations[session],
-            )
-            for session, pixels in enumerate(self.reprojection_px.tolist())
-        ]
-
     def _add_point_losses(self) -> Couplings:
         """Add the losses without cameras to the points' gradient and Hessian. Returns the blocks off the diagonal."""
         m = self.objective.measurements
@@ -275,12 +234,11 @@ class NormalEquations:
     def _add_frame_losses(self) -> WithinFrame:
         """Add the frame losses. Returns the blocks between different points of a frame."""
         m, within = self.objective.measurements, WithinFrame()
-        hessian, gradient = m.by_frame(self.point_hessian), m.by_frame(self.point_gradient)
+        hessian = m.by_frame(self.point_hessian)
         for name, terms in self.objective.linearise_frames(self.state, self._exact).items():
-            self.terms[name] = self.terms[name] + terms.cost
+            self._add_frame_gradient(name, terms)
             members = self.objective.groups[name].unbind(1)
             for number, points in enumerate(members):
-                gradient.index_add_(-1, points, terms.gradient[:, number].to(gradient.dtype))
                 hessian.index_add_(-1, points, terms.hessian[:, number].to(hessian.dtype))
             for (first, second), blocks in zip(itertools.combinations(members, 2), terms.cross.unbind(1), strict=True):
                 within.add(first, second, blocks.to(hessian.dtype))
@@ -291,14 +249,13 @@ class NormalEquations:
         m = self.objective.measurements
         if not self.objective.track_losses:
             return None
-        hessian, gradient = m.by_frame(self.point_hessian), m.by_frame(self.point_gradient)
+        hessian = m.by_frame(self.point_hessian)
         between = [hessian.new_zeros(m.sessions, max(0, m.frames - step), m.points_per_frame) for step in (1, 2)]
         for name, terms in self.objective.linearise_tracks(self.state).items():
-            self.terms[name] = self.terms[name] + terms.cost
+            self._add_track_gradient(name, terms)
             stencil, frames = self.objective.track_losses[name].stencil, terms.scale.shape[1]
-            information, slope = terms.scale.square().to(hessian.dtype), terms.scale[:, None] * terms.residual
+            information = terms.scale.square().to(hessian.dtype)
             for i, factor in enumerate(stencil):
-                gradient[:, :, i : i + frames] += factor * slope
                 for axis in DIAGONAL:
                     hessian[:, axis, i : i + frames] += factor**2 * information
                 for j, other in enumerate(stencil[i + 1 :], i + 1):
@@ -309,7 +266,6 @@ class NormalEquations:
         """Linearise the camera-point losses of every part and, if the cameras are free, build the reduced camera system."""
         m, free, zeros = self.objective.measurements, self._free_cameras, self.state.points.new_zeros
         size = 6 * free + self._unknowns.count
-        squares, weights = zeros(m.sessions, m.num_cameras), zeros(m.sessions, m.num_cameras)
         reduced, reduced_gradient = zeros(m.sessions, size, size), zeros(m.sessions, size)
         sums = CameraSums(self.state.points, m.num_cameras, free, self._unknowns.components)
         bytes_per_row = 3 * m.sessions * m.num_columns * m.pixels.element_size()
@@ -321,9 +277,7 @@ class NormalEquations:
             for columns in part.chunks:
                 terms = self._linearise(columns)
                 for name, term in terms.items():
-                    self.terms[name] = self.terms[name] + term.cost
-                    squares += term.squares
-                    weights += term.weights
+                    self._add_images(name, term.cost, term.squares, term.weights)
                 gradient, hessian, unknown = _sum_over_losses(terms)
                 self.point_gradient[..., columns] += gradient.sum(1)
                 self.point_hessian[..., columns] += hessian.sum(1)
@@ -338,37 +292,28 @@ class NormalEquations:
                 reduced_gradient -= (rows @ solved[..., None])[..., 0]
                 if self._cache is not None:
                     self._cache.append(eliminated._replace(rows=rows) if keeps_rows else eliminated)
+        self._sum_up_images(sums)
         rig_hessian = self._rig_hessian(sums)
         self._rig_diagonal = rig_hessian.diagonal(dim1=1, dim2=2).clone()
         rig_hessian.diagonal(dim1=1, dim2=2).mul_(1 + self._damping[:, None])
         self.reduced = reduced.add_(rig_hessian)
         self.reduced_gradient = reduced_gradient + torch.cat([self.camera_gradient.flatten(1), self.unknown_gradient], dim=1)
-        self.reprojection_px = (squares / weights.clamp_min(1e-300)).sqrt()
 
     def _rig_hessian(self, sums: CameraSums) -> Tensor:
-        """H_cc with the lens and clock unknowns, (B, 6 C' + K, 6 C' + K). Sets the gradients and adds the prior."""
+        """H_cc with the lens and clock unknowns and their prior, (B, 6 C' + K, 6 C' + K)."""
         free, unknowns = self._free_cameras, self._unknowns
         tangents, size = 6 * free, 6 * free + unknowns.count
         hessian = self.state.points.new_zeros(len(self.state.points), size, size)
         poses = hessian[:, :tangents, :tangents].view(len(hessian), free, 6, free, 6)
         poses.diagonal(dim1=1, dim2=3).copy_(sums.pose_hessian(self._exact).permute(0, 2, 3, 1))
-        self.camera_gradient = sums.pose_gradient()
-        self.unknown_gradient = hessian.new_zeros(len(hessian), unknowns.count)
         if unknowns.count:
             share = unknowns.share
             with_poses = torch.einsum("ckj,bckt->bctj", share[1:], sums.unknown_pose_hessian()).flatten(1, 2)
             hessian[:, :tangents, tangents:] = with_poses
             hessian[:, tangents:, :tangents] = with_poses.mT
             hessian[:, tangents:, tangents:] = torch.einsum("cki,bckl,clj->bij", share, sums.unknown_hessian, share)
-            self.unknown_gradient = torch.einsum("ckj,bck->bj", share, sums.unknown_gradient)
-            self._add_prior(hessian[:, tangents:, tangents:])
+            hessian[:, tangents:, tangents:].diagonal(dim1=1, dim2=2).add_(self._prior_information)
         return hessian
-
-    def _add_prior(self, hessian: Tensor) -> None:
-        """Add the prior of the lens and clock unknowns to the terms, to their gradient, and to their block (B, K, K)."""
-        self.terms[PRIOR], gradient, information = self.objective.linearise_prior(self.state)
-        self.unknown_gradient += gradient
-        hessian.diagonal(dim1=1, dim2=2).add_(information)
 
     def _linearise(self, columns: Columns) -> dict[str, CameraPointTerms]:
         return self.objective.linearise_chunk(self.state, columns, self._exact, self._unknowns.count > 0)
