@@ -192,11 +192,13 @@ class Intrinsics:
         mixed_u, mixed_v = torch.addcmul(2 * p1, v, by_u), torch.addcmul(2 * p2, u, by_v)
         own_u = torch.addcmul(6 * p2, u, torch.add(by_u, twice_slope, alpha=2))
         own_v = torch.addcmul(6 * p1, v, torch.add(by_v, twice_slope, alpha=2))
-        return torch.addcmul(a * own_u, b, mixed_u), torch.addcmul(a * mixed_u, b, mixed_v), torch.addcmul(a * mixed_v, b, own_v)
+        return (
+            torch.addcmul(a * own_u, b, mixed_u),
+            torch.addcmul(a * mixed_u, b, mixed_v),
+            torch.addcmul(a * mixed_v, b, own_v),
+        )
 
-    def _curvature_by_autograd(
-        self, u: Tensor, v: Tensor, along_x: Tensor, along_y: Tensor
-    ) -> tuple[Tensor, Tensor, Tensor]:
+    def _curvature_by_autograd(self, u: Tensor, v: Tensor, along_x: Tensor, along_y: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """:meth:`pixel_curvature` of any lens."""
         with torch.enable_grad():
             u, v = u.detach().requires_grad_(), v.detach().requires_grad_()
