@@ -9,6 +9,7 @@ from torch import Tensor
 from torch.nn.functional import pad
 
 from torchstickcal.geometry.symmetric import are_definite
+from torchstickcal.lazy import cached_property
 from torchstickcal.model.objective import Objective
 from torchstickcal.model.state import State
 from torchstickcal.solvers.elimination.evaluated import Gradient
@@ -70,6 +71,11 @@ class Linearised:
         self.objective, self.state, self.cameras_free = objective, state, cameras_free
         self._systems: dict[bool, NormalEquations] = {}
 
+    @cached_property
+    def _points_definite(self) -> Tensor:
+        """Whether the exact Hessians of all points are positive definite, (B,)."""
+        return are_definite(self._system(exact=True).point_hessian)
+
     @property
     def gradient(self) -> Tangent:
         """Half the derivative of the objective."""
@@ -82,7 +88,8 @@ class Linearised:
         Where the exact Hessian is not positive definite, Newton's step leads anywhere, and that of Gauss-Newton is taken.
         """
         step = self.solve(gradient)
-        definite = are_definite(self._system(exact=True).point_hessian) & ~((step.dot(gradient) <= 0) & gradient.nonzero)
+        falling = step.dot(gradient) > 0
+        definite = self._points_definite & (falling if bool(falling.all()) else falling | ~gradient.nonzero)
         if bool(definite.all()):
             return step
         return step.where(definite).plus(self.solve(gradient, exact=False).where(~definite))

@@ -1,9 +1,9 @@
 """Elimination of tracks: points that losses couple over time. It is exact, and its cost is linear in the number of frames.
 
 A second difference couples three consecutive frames. With two or more frames per block the Hessian of a track is therefore
-block tridiagonal. It is factored by cyclic reduction: all odd blocks of all tracks are eliminated at once. A block tridiagonal matrix
-with half as many blocks remains, and is reduced in the same way. Points that losses couple within a frame, such as the ends of
-a stick, form one track.
+block tridiagonal. It is factored by cyclic reduction: all odd blocks of all tracks are eliminated at once. A block tridiagonal
+matrix with half as many blocks remains, and is reduced in the same way. Points that losses couple within a frame, such as the
+ends of a stick, form one track.
 """
 
 from __future__ import annotations
