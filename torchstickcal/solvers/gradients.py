@@ -313,7 +313,7 @@ def _adjoint(minimum: Linearised, mode: GradientMode, gradient: Tangent, objecti
         adjoint, times_hessian = (
             total.plus(total.like(part)) for total, part in zip((adjoint, times_hessian), moved, strict=True)
         )
-        if bool((~missing | (squared.square() <= limit * before)).all()):  # the next step would be as short
+        if bool((~missing | (squared.square() <= 0.01 * limit * before)).all()):  # the next step would be as short
             break
         before = squared
     return adjoint

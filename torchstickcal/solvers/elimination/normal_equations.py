@@ -90,6 +90,8 @@ class _EliminatedPart(NamedTuple):
 
     def back_substituted(self, rhs: Tensor, points: Tensor, camera_step: Tensor, unknown_step: Tensor) -> Tensor:
         """``H_xx^-1 (b - H_xc s)`` (B, 3, n), for a right-hand side b (B, 3, n) and a step s of cameras and unknowns."""
+        if not self.coupling.camera_blocks.shape[1]:
+            return self.elimination.solve(rhs)
         if self.rows is None:
             return self.elimination.solve(rhs - self._cross_product(points, camera_step, unknown_step))
         step = torch.cat([camera_step.flatten(1), unknown_step], dim=1).to(rhs.dtype)
