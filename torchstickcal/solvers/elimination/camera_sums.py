@@ -56,6 +56,15 @@ class CameraSums:
             self.unknown_gradient += unknown_gradient
         return homogeneous
 
+    def include(self, other: CameraSums) -> None:
+        """Add the sums over other points."""
+        self._gradient_moments += other._gradient_moments
+        self._hessian_moments += other._hessian_moments
+        if self.unknown_gradient.numel():
+            self._unknown_moments += other._unknown_moments
+            self.unknown_gradient += other.unknown_gradient
+            self.unknown_hessian += other.unknown_hessian
+
     def pose_gradient(self) -> Tensor:
         """Gradient with respect to the tangents, (B, C', 6)."""
         return self._gradient_moments.view(self._sessions, self._free, 12) @ self._gradient_map

@@ -5,13 +5,15 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from torchstickcal.losses.camera_point import CameraPointSlopes, CameraPointTerms
 from torchstickcal.losses.frame import FrameTerms
 from torchstickcal.losses.track import TrackTerms
 from torchstickcal.model.objective import PRIOR, Objective
 from torchstickcal.model.state import State
-from torchstickcal.model.unknowns import Columns, RigUnknowns
+from torchstickcal.model.unknowns import RigUnknowns
 from torchstickcal.solvers.base import IterationRecord
 from torchstickcal.solvers.elimination.camera_sums import CameraSums
+from torchstickcal.workers import map_with_idle_workers
 
 
 class Evaluated:
@@ -87,11 +89,15 @@ class Evaluated:
         for first, factor in enumerate(self.objective.track_losses[name].stencil):
             gradient[:, :, first : first + frames] += factor * slope
 
-    def _add_images(self, name: str, cost: Tensor, squares: Tensor, weights: Tensor) -> None:
+    def _add_images(self, name: str, found: CameraPointSlopes | CameraPointTerms) -> None:
         """Add a camera-point loss at some columns to the terms and to the reprojection error."""
-        self.terms[name] = self.terms[name] + cost
-        self._squares += squares
-        self._weights += weights
+        self.terms[name] = self.terms[name] + found.cost
+        self._squares += found.squares
+        self._weights += found.weights
+
+    def _new_sums(self) -> CameraSums:
+        m = self.objective.measurements
+        return CameraSums(self.state.points, m.num_cameras, self._free_cameras, self._unknowns.components)
 
     def _sum_up_images(self, sums: CameraSums) -> None:
         """Set the reprojection error, and the gradients by the cameras, after all columns."""
@@ -116,21 +122,26 @@ class Gradient(Evaluated):
 
     def __init__(self, objective: Objective, state: State, cameras_free: bool, dtype: torch.dtype | None = None) -> None:
         super().__init__(objective, state, cameras_free)
-        m, unknowns = objective.measurements, self._unknowns
+        m = objective.measurements
         self.point_gradient = m.pixels.new_zeros(m.sessions, 3, m.num_columns, dtype=dtype)
         for name, terms in objective.linearise_frames(state).items():
             self._add_frame_gradient(name, terms)
         for name, terms in objective.linearise_tracks(state).items():
             self._add_track_gradient(name, terms)
-        sums = CameraSums(state.points, m.num_cameras, self._free_cameras, unknowns.components)
-        for columns in m.chunks():
-            self._add_chunk(columns, sums, dtype)
+        sums = self._new_sums()
+        for found, own_sums in map_with_idle_workers(lambda columns: self._chunk(columns, dtype), m.chunks()):
+            for name, slopes in found.items():
+                self._add_images(name, slopes)
+            sums.include(own_sums)
         self._sum_up_images(sums)
 
-    def _add_chunk(self, columns: Columns, sums: CameraSums, dtype: torch.dtype | None) -> None:
-        for name, slopes in self.objective.slopes_of_chunk(self.state, columns, self._unknowns.count > 0, dtype).items():
-            self._add_images(name, slopes.cost, slopes.squares, slopes.weights)
+    def _chunk(self, columns: slice, dtype: torch.dtype | None) -> tuple[dict[str, CameraPointSlopes], CameraSums]:
+        """The camera-point losses at some columns. Adds them to the points' gradient."""
+        found = self.objective.slopes_of_chunk(self.state, columns, self._unknowns.count > 0, dtype)
+        sums = self._new_sums()
+        for slopes in found.values():
             self.point_gradient[..., columns] += slopes.gradient.sum(1)
             if self._free_cameras:
                 points = self.state.points[..., columns].to(slopes.gradient)
                 sums.add_gradient(points, slopes.gradient, slopes.unknown_gradient)
+        return {name: slopes._replace(gradient=slopes.gradient[..., :0]) for name, slopes in found.items()}, sums

@@ -20,9 +20,9 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import reduce
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import torch
 from torch import Tensor
@@ -39,6 +39,9 @@ from torchstickcal.solvers.elimination.evaluated import Evaluated
 from torchstickcal.solvers.elimination.parts import BetweenFrames, Couplings, Part, WithinFrame, parts
 from torchstickcal.solvers.elimination.points import PointElimination
 from torchstickcal.solvers.elimination.tracks import TrackElimination
+from torchstickcal.workers import map_with_idle_workers
+
+_Result = TypeVar("_Result")
 
 _MAX_CACHED_BYTES = 2**28
 """Memory up to which the blocks N_c are cached for the back-substitution."""
@@ -111,6 +114,20 @@ class _EliminatedPart(NamedTuple):
         return product
 
 
+class _PartTerms(NamedTuple):
+    """What a part adds to the system of the cameras."""
+
+    images: list[tuple[str, CameraPointTerms]]
+    """the camera-point losses, without what there is one of per column"""
+    sums: CameraSums
+    rows_squared: Tensor
+    """W^T W"""
+    rows_gradient: Tensor
+    """``W^T L^-1 g``"""
+    eliminated: _EliminatedPart | None
+    """the part, where it is kept"""
+
+
 class NormalEquations(Evaluated):
     """The Gauss-Newton system of B sessions at a state.
 
@@ -146,7 +163,7 @@ class NormalEquations(Evaluated):
         m, self._exact = objective.measurements, exact
         self._damping = torch.as_tensor(damping, dtype=torch.float64, device=state.points.device).expand(m.sessions)
         self._parts = parts(m, objective.clusters, self._add_point_losses())
-        self._cache: list[_EliminatedPart] | None = None
+        self._cache: dict[int, _EliminatedPart] = {}
         self._add_camera_point_losses()
 
     def step(self) -> Step:
@@ -159,12 +176,17 @@ class NormalEquations(Evaluated):
         rig_gradient = torch.cat([self.camera_gradient.flatten(1), self.unknown_gradient], dim=1)
         descent = -(rig_gradient * rig_step).sum(1)
         squared = (self._rig_diagonal * rig_step.square()).sum(1)
-        for part, eliminated in self._eliminated_parts():
+
+        def step_of(part: Part, eliminated: _EliminatedPart) -> tuple[Tensor, Tensor]:
             rhs = -gradient[..., part.columns]
             solved = eliminated.back_substituted(rhs, self.state.points[..., part.columns], camera_step, unknown_step)
             point_step[..., part.columns] = solved
-            descent += (rhs * solved).sum((1, 2), dtype=torch.float64)
-            squared += (hessian[..., part.columns][:, DIAGONAL] * solved.square()).sum((1, 2), dtype=torch.float64)
+            weighted = hessian[..., part.columns][:, DIAGONAL] * solved.square()
+            return (rhs * solved).sum((1, 2), dtype=torch.float64), weighted.sum((1, 2), dtype=torch.float64)
+
+        for own_descent, own_squared in self._of_parts(step_of):
+            descent += own_descent
+            squared += own_squared
         damped = squared * self._damping
         squared_sigmas = -(self.reduced_gradient * rig_step).sum(1)
         return Step(
@@ -190,16 +212,23 @@ class NormalEquations(Evaluated):
         """
         point_rhs = point_rhs.to(self.point_hessian.dtype)
         reduced_rhs = torch.cat([camera_rhs.flatten(1), unknown_rhs], dim=1)
-        for part, eliminated in self._eliminated_parts() if self._free_cameras else ():
+
+        def reduced_share(part: Part, eliminated: _EliminatedPart) -> Tensor:
             solved = eliminated.elimination.forward_solve(point_rhs[..., part.columns])
-            reduced_rhs = reduced_rhs - (eliminated.solved_rows(self._points(part.columns)) @ solved[..., None])[..., 0]
+            return (eliminated.solved_rows(self._points(part.columns)) @ solved[..., None])[..., 0]
+
+        for share in self._of_parts(reduced_share) if self._free_cameras else ():
+            reduced_rhs = reduced_rhs - share
         factor, failed = torch.linalg.cholesky_ex(self.reduced)
         rig = torch.cholesky_solve(reduced_rhs[..., None], factor)[..., 0]
         cameras, unknowns = self._split(rig)
         points = torch.empty_like(point_rhs)
-        for part, eliminated in self._eliminated_parts():
+
+        def back_substitute(part: Part, eliminated: _EliminatedPart) -> None:
             own = point_rhs[..., part.columns], self.state.points[..., part.columns]
             points[..., part.columns] = eliminated.back_substituted(*own, cameras, unknowns)
+
+        self._of_parts(back_substitute)
         finite = rig.isfinite().all(1) & points.flatten(1).isfinite().all(1)
         return cameras, unknowns, points, (failed == 0) & finite
 
@@ -217,10 +246,13 @@ class NormalEquations(Evaluated):
         """``-H_xx^-1 H_xc``: movement of the points per unit step of the cameras, (B, 6 C' + K, 3, N)."""
         points = self.state.points
         response = points.new_empty(len(points), self.reduced.shape[1], *points.shape[1:])
-        for part, eliminated in self._eliminated_parts():
+
+        def respond(part: Part, eliminated: _EliminatedPart) -> None:
             rows = eliminated.solved_rows(self._points(part.columns))
             for row in range(rows.shape[1]):
                 response[:, row][..., part.columns] = -eliminated.elimination.backward_solve(rows[:, row]).to(response)
+
+        self._of_parts(respond)
         return response
 
     def _add_point_losses(self) -> Couplings:
@@ -266,40 +298,50 @@ class NormalEquations(Evaluated):
 
     def _add_camera_point_losses(self) -> None:
         """Linearise the camera-point losses of every part and, if the cameras are free, build the reduced camera system."""
-        m, free, zeros = self.objective.measurements, self._free_cameras, self.state.points.new_zeros
-        size = 6 * free + self._unknowns.count
-        reduced, reduced_gradient = zeros(m.sessions, size, size), zeros(m.sessions, size)
-        sums = CameraSums(self.state.points, m.num_cameras, free, self._unknowns.components)
+        m, zeros = self.objective.measurements, self.state.points.new_zeros
+        size = 6 * self._free_cameras + self._unknowns.count
+        reduced, reduced_gradient, sums = zeros(m.sessions, size, size), zeros(m.sessions, size), self._new_sums()
         bytes_per_row = 3 * m.sessions * m.num_columns * m.pixels.element_size()
         keeps_rows = size * bytes_per_row <= _MAX_SOLVED_BYTES
-        if keeps_rows or (2 * free + self._unknowns.count) * bytes_per_row <= _MAX_CACHED_BYTES:
-            self._cache = []
-        for part in self._parts:
-            chunks: list[_CameraCoupling] = []
-            for columns in part.chunks:
-                terms = self._linearise(columns)
-                for name, term in terms.items():
-                    self._add_images(name, term.cost, term.squares, term.weights)
-                gradient, hessian, unknown = _sum_over_losses(terms)
-                self.point_gradient[..., columns] += gradient.sum(1)
-                self.point_hessian[..., columns] += hessian.sum(1)
-                if free:
-                    sums.add(self._points(columns), gradient, hessian, unknown)
-                    chunks.append(self._camera_coupling(gradient, hessian, unknown))
-            if free:
-                eliminated = self._eliminate(part, chunks)
-                rows = eliminated.solved_rows(self._points(part.columns))
-                solved = eliminated.elimination.forward_solve(self.point_gradient[..., part.columns])
-                reduced -= rows @ rows.mT
-                reduced_gradient -= (rows @ solved[..., None])[..., 0]
-                if self._cache is not None:
-                    self._cache.append(eliminated._replace(rows=rows) if keeps_rows else eliminated)
+        keeps = keeps_rows or (2 * self._free_cameras + self._unknowns.count) * bytes_per_row <= _MAX_CACHED_BYTES
+        found = map_with_idle_workers(lambda part: self._part_terms(part, keeps, keeps_rows), self._parts)
+        for index, terms in enumerate(found):
+            for name, term in terms.images:
+                self._add_images(name, term)
+            if self._free_cameras:
+                sums.include(terms.sums)
+                reduced -= terms.rows_squared
+                reduced_gradient -= terms.rows_gradient
+            if terms.eliminated is not None:
+                self._cache[index] = terms.eliminated
         self._sum_up_images(sums)
         rig_hessian = self._rig_hessian(sums)
         self._rig_diagonal = rig_hessian.diagonal(dim1=1, dim2=2).clone()
         rig_hessian.diagonal(dim1=1, dim2=2).mul_(1 + self._damping[:, None])
         self.reduced = reduced.add_(rig_hessian)
         self.reduced_gradient = reduced_gradient + torch.cat([self.camera_gradient.flatten(1), self.unknown_gradient], dim=1)
+
+    def _part_terms(self, part: Part, keeps: bool, keeps_rows: bool) -> _PartTerms:
+        """Linearise a part's camera-point losses, add them to the points' blocks, and eliminate it if the cameras are free."""
+        images: list[tuple[str, CameraPointTerms]] = []
+        chunks: list[_CameraCoupling] = []
+        sums, empty = self._new_sums(), self.state.points[:, :0, 0]
+        for columns in part.chunks:
+            terms = self._linearise(columns)
+            images += [(name, term._replace(gradient=empty, hessian=empty, unknown=None)) for name, term in terms.items()]
+            gradient, hessian, unknown = _sum_over_losses(terms)
+            self.point_gradient[..., columns] += gradient.sum(1)
+            self.point_hessian[..., columns] += hessian.sum(1)
+            if self._free_cameras:
+                sums.add(self._points(columns), gradient, hessian, unknown)
+                chunks.append(self._camera_coupling(gradient, hessian, unknown))
+        if not self._free_cameras:
+            return _PartTerms(images, sums, empty, empty, None)
+        eliminated = self._eliminate(part, chunks)
+        rows = eliminated.solved_rows(self._points(part.columns))
+        solved = eliminated.elimination.forward_solve(self.point_gradient[..., part.columns])
+        kept = eliminated._replace(rows=rows) if keeps_rows else eliminated
+        return _PartTerms(images, sums, rows @ rows.mT, (rows @ solved[..., None])[..., 0], kept if keeps else None)
 
     def _rig_hessian(self, sums: CameraSums) -> Tensor:
         """H_cc with the lens and clock unknowns and their prior, (B, 6 C' + K, 6 C' + K)."""
@@ -325,12 +367,18 @@ class NormalEquations(Evaluated):
         tangents = 6 * self._free_cameras
         return rig[:, :tangents].unflatten(1, (self._free_cameras, 6)), rig[:, tangents:]
 
-    def _eliminated_parts(self) -> Iterator[tuple[Part, _EliminatedPart]]:
-        """All parts, eliminated: from the cache, or computed again."""
-        if not self._cache and not self._free_cameras:
-            self._cache = [self._eliminate(part) for part in self._parts]
-        for index, part in enumerate(self._parts):
-            yield part, self._cache[index] if self._cache else self._eliminate(part)
+    def _of_parts(self, function: Callable[[Part, _EliminatedPart], _Result]) -> list[_Result]:
+        """The results of a function of every part, eliminated: from the cache, or computed again."""
+
+        def of_part(index: int) -> _Result:
+            part, eliminated = self._parts[index], self._cache.get(index)
+            if eliminated is None:
+                eliminated = self._eliminate(part)
+                if not self._free_cameras:
+                    self._cache[index] = eliminated
+            return function(part, eliminated)
+
+        return map_with_idle_workers(of_part, range(len(self._parts)))
 
     def _eliminate(self, part: Part, chunks: list[_CameraCoupling] | None = None) -> _EliminatedPart:
         """Factor a part. ``chunks`` are the couplings of its chunks; None to compute them."""

@@ -113,10 +113,10 @@ class TrackElimination:
             between = empty, empty
         self._shape = tracks, frames, hessian.shape[-1]
         by_track = diagonal.reshape(sessions * tracks, frames, *diagonal.shape[-2:])
-        couplings = (factors.transpose(1, 2).flatten(0, 1).repeat_interleave(3, -1) for factors in between)
+        next_frame, second_frame = (factors.transpose(1, 2).flatten(0, 1).repeat_interleave(3, -1) for factors in between)
         self._size = max(2, min(_ROWS_PER_BLOCK // (3 * hessian.shape[-1]), frames))
         """frames per block"""
-        self._factor = BlockTridiagonal(*_block_tridiagonal(by_track, *couplings, self._size))
+        self._factor = BlockTridiagonal(*_block_tridiagonal(by_track, next_frame, second_frame, self._size))
 
     def forward_solve(self, rhs: Tensor) -> Tensor:
         """``L^-1 b`` for right-hand sides b, (B, 3, n): (B, 3 n'), in the order of elimination, with n' >= n."""
