@@ -399,7 +399,7 @@ def points_used(observations: Observations, config: Config) -> list[int] | None:
 def _with_last_camera_stage(adjustment: Adjustment, run: Run) -> Adjustment:
     """After the last stage that estimates cameras, with clocks and noise that agree with what it found."""
     *_, last = run.camera_stages.items()
-    roughly = run.to_rounding and run.settles and not adjustment.asynchronous
+    roughly = run.settles and not adjustment.asynchronous
     return _settled(_synchronised(through([last], adjustment, run, roughly), run), run)
 
 
