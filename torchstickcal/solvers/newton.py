@@ -20,8 +20,6 @@ _MAX_ROUNDS = 40
 _ROUNDING_SIGMAS, _NEAR_SIGMAS = 1e-7, 1e-3
 """Length of a step, in standard deviations of the estimate, below which it is the last: for a minimum up to rounding errors, or
 near enough for everything but gradients, and as near as float32 allows."""
-_EXPECTED_SHARE = 0.1
-"""A step is the last, too, if the next one would be shorter than this share of that length, as steps become shorter."""
 _CONVERGED_SIGMAS = 1e-2
 """The same, below which it has converged as far as rounding allows."""
 _SLOW, _OLD = 0.3, 3
@@ -66,12 +64,11 @@ def minimum_near(
         step = at.descent(gradient)
         length = step.dot(gradient).clamp_min(0.0).sqrt()
         shorter = length < shortest
-        next_length = torch.where(shortest.isfinite(), length.square() / shortest, length)
         slow = bool((moving & ~(length < _SLOW * shortest)).any())
         if not back:
             best = trial if bool((shorter | ~moving).all()) else best.replaced(moving & shorter, trial)
             shortest = torch.where(moving & shorter, length, shortest)
-            ended = moving & shorter & ((length <= tolerance) | (next_length <= _EXPECTED_SHARE * tolerance))
+            ended = moving & (shortest <= tolerance)
             best = best.replaced(ended, _moved(best, step, -1.0)) if bool(ended.any()) else best
             moving &= ~ended & (shorter if age_of_step == 0 else True)
         if not bool(moving.any()):
