@@ -162,13 +162,15 @@ def without(evidence: Evidence, camera: int) -> Rest | None:
     return Rest(ended, points, ended.last.sigma_px[0])
 
 
-def tried(observations: Observations, config: Config, refined: tuple[str, ...]) -> Adjustment | None:
-    """A session adjusted in few iterations without anybody listening; None where its cameras are no rig."""
+def tried(
+    observations: Observations, config: Config, refined: tuple[str, ...], must_converge: bool = False
+) -> Adjustment | None:
+    """A session adjusted in few iterations without anybody listening; None where its cameras are no rig, or do not converge."""
     stages = {
         name: replace(stage, max_iterations=min(stage.max_iterations, _TRIAL_ITERATIONS))
         for name, stage in config.stages.items()
     }
-    run = Run(replace(config, stages=stages))
+    run = Run(replace(config, stages=stages), must_converge=must_converge)
     try:
         return adjust_cameras(begin(observations, run, refined), run)
     except CalibrationError:

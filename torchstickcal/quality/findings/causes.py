@@ -146,8 +146,9 @@ def _of_a_pair(evidence: Evidence) -> Iterator[Finding]:
             keypoints, matrix = observations.keypoints.clone(), observations.cameras.matrix.clone()
             keypoints[camera] = changed.keypoints.to(keypoints)
             matrix[camera] = changed.camera.matrix[0]
-            ended = tried(replace(observations, keypoints=keypoints, intrinsics=matrix), evidence.config, ())
-            if ended is None or not ended.converged:
+            trial = replace(observations, keypoints=keypoints, intrinsics=matrix)
+            ended = tried(trial, evidence.config, (), must_converge=True)
+            if ended is None:
                 continue
             share = float(ended.kept.visible.sum() / ended.measurements.visible.sum().clamp_min(1))
             own = 1000 * float(ended.last.sigma_px[0].median() / ended.measurements.cameras.focal_px.mean())
