@@ -21,7 +21,7 @@ from torchstickcal.pipeline.run import Run
 from torchstickcal.pipeline.scale import outvoted_factors, rulers, scale_factors
 from torchstickcal.solvers import StageRecord, Stop, Termination, solver
 
-_RESOLUTION = {torch.float64: 0.0, torch.float32: 1e-6}
+_RESOLUTION = {torch.float64: 0.0, torch.float32: 1e-7}
 """Relative decrease of the cost that can be distinguished from rounding."""
 _LEAST_AGREEING_SHARE = 0.15
 """Share of a camera's keypoints that must agree with the other cameras. Sound cameras have more than 0.8, cameras that see
