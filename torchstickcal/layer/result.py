@@ -66,7 +66,7 @@ class LayerResult:
     sigma_px: Tensor
     """(B, P), estimated noise of each point's keypoints, pixels"""
     converged: Tensor
-    """(B,); the gradients of a session that could not be calibrated are zero"""
+    """(B,); the gradients of a session that has not converged are zero"""
     status: tuple[str, ...]
     """``converged``, or why not, for each session"""
 
