@@ -44,6 +44,21 @@ class UnknownTerms(NamedTuple):
     """(..., C, k, 3, N): the block with the point, in world axes"""
 
 
+class CameraPointSlopes(NamedTuple):
+    """A camera-point loss at C cameras and N points, with its first derivatives."""
+
+    cost: Tensor
+    """(...): the loss"""
+    squares: Tensor
+    """(..., C): weighted sum of squared residuals, in the residual's unit"""
+    weights: Tensor
+    """(..., C): sum of those weights"""
+    gradient: Tensor
+    """(..., C, 3, N): half the derivative by the point, in world axes"""
+    unknown_gradient: Tensor | None
+    """(..., C, k): the same by what else is unknown of the cameras; None where that is nothing"""
+
+
 class CameraPointTerms(NamedTuple):
     """A camera-point loss, linearised at C cameras and N points."""
 
@@ -177,6 +192,32 @@ class CameraPointLoss(Loss, ABC):
             gradient=rotations.mT @ gradient,
             hessian=six_entries(hessian.movedim(-3, -1)),
             unknown=terms,
+        )
+
+    def slopes(
+        self,
+        points_cam: Tensor,
+        rotations: Tensor,
+        pixels: Tensor,
+        information: Tensor,
+        cameras: Intrinsics,
+        unknowns: CameraUnknownsAt | None = None,
+    ) -> CameraPointSlopes:
+        """The terms of first order alone, here by automatic differentiation; the arguments are those of :meth:`linearise`."""
+        squared = self._squared(points_cam, pixels, cameras)
+        weights = self.weight * information * self.kernel.weight(squared * information)
+        residuals, jacobian = self._with_jacobian(points_cam, pixels, cameras)
+        gradient = torch.einsum("...nm,...nmi,...n->...in", residuals, jacobian, weights)
+        by_unknowns = None
+        if unknowns is not None:
+            columns = self._by_unknowns(unknowns, points_cam)
+            by_unknowns = torch.einsum("...cknm,...cnm,...cn->...ck", columns, residuals, weights)
+        return CameraPointSlopes(
+            cost=self.total(squared * information, over=2),
+            squares=(weights * squared).sum(-1),
+            weights=weights.sum(-1),
+            gradient=rotations.mT @ gradient,
+            unknown_gradient=by_unknowns,
         )
 
     def slope(

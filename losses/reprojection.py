@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, Literal, Self
+from typing import Any, Literal, NamedTuple, Self
 
 import torch
 from torch import Tensor
@@ -12,7 +12,13 @@ from torch import Tensor
 from torchstickcal.geometry import projection
 from torchstickcal.geometry.cameras import Intrinsics, PixelMap, inverse_depths
 from torchstickcal.geometry.symmetric import outer, symmetric_product
-from torchstickcal.losses.camera_point import CameraPointLoss, CameraPointTerms, CameraUnknownsAt, UnknownTerms
+from torchstickcal.losses.camera_point import (
+    CameraPointLoss,
+    CameraPointSlopes,
+    CameraPointTerms,
+    CameraUnknownsAt,
+    UnknownTerms,
+)
 from torchstickcal.losses.registry import LossContext, LossSettings, register_loss
 from torchstickcal.losses.robust import Quadratic, Repeated, RobustKernel, robust_kernel
 from torchstickcal.settings import Positive
@@ -113,56 +119,71 @@ class ReprojectionLoss(CameraPointLoss):
         exact: bool = False,
         unknowns: CameraUnknownsAt | None = None,
     ) -> CameraPointTerms:
-        # The derivative of (u, v) by the world point has the rows p / z and q / z, p = r1 - u r3 and q = r2 - v r3 with the
-        # rows r of the rotation; M, the derivative of the pixel by (u, v), gives J^T W J = [p q] (M^T W M / z^2) [p q]^T.
+        at = self._seen(points_cam, rotations, pixels, information, cameras)
+        # With the derivatives a and b of a keypoint's x and y by the world point: J^T W J = a (w a)^T + b (w b)^T.
+        along_a, along_b = at.weights.unsqueeze(-2) * at.a, at.weights.unsqueeze(-2) * at.b
+        gradient = along_a * at.rx.unsqueeze(-2)
+        gradient.addcmul_(along_b, at.ry.unsqueeze(-2))
+        if exact:
+            bend = 2 * self.weight * information.square() * self.kernel.curvature(at.squared)
+            by_squared = (at.a * at.rx.unsqueeze(-2)).addcmul_(at.b, at.ry.unsqueeze(-2))
+            along_a.addcmul_((bend * at.rx).unsqueeze(-2), by_squared)
+            along_b.addcmul_((bend * at.ry).unsqueeze(-2), by_squared)
+        hessian = at.a.new_empty(*at.a.shape[:-2], 6, at.a.shape[-1])
+        for entries, axis in ((slice(0, 3), 0), (slice(3, 5), 1), (slice(5, 6), 2)):
+            block = hessian[..., entries, :]
+            torch.mul(at.a[..., axis : axis + 1, :], along_a[..., axis:, :], out=block)
+            block.addcmul_(at.b[..., axis : axis + 1, :], along_b[..., axis:, :])
+        if exact:
+            hessian += at.curvature(rotations, gradient, cameras)
+        return CameraPointTerms(
+            cost=self.total(at.squared, over=2),
+            squares=(at.weights * at.squared_px).sum(-1),
+            weights=at.weights.sum(-1),
+            gradient=gradient,
+            hessian=hessian,
+            unknown=None if unknowns is None else _by_unknowns(unknowns.projection_derivatives(at.u, at.v, at.pixel), at),
+        )
+
+    def slopes(
+        self,
+        points_cam: Tensor,
+        rotations: Tensor,
+        pixels: Tensor,
+        information: Tensor,
+        cameras: Intrinsics,
+        unknowns: CameraUnknownsAt | None = None,
+    ) -> CameraPointSlopes:
+        at = self._seen(points_cam, rotations, pixels, information, cameras)
+        wx, wy = (at.weights * r for r in (at.rx, at.ry))
+        gradient = at.a * wx.unsqueeze(-2)
+        by_unknowns = None
+        if unknowns is not None:
+            ex, ey = unknowns.projection_derivatives(at.u, at.v, at.pixel)
+            by_unknowns = (ex @ wx.unsqueeze(-1) + ey @ wy.unsqueeze(-1))[..., 0]
+        return CameraPointSlopes(
+            cost=self.total(at.squared, over=2),
+            squares=(at.weights * at.squared_px).sum(-1),
+            weights=at.weights.sum(-1),
+            gradient=gradient.addcmul_(at.b, wy.unsqueeze(-2)),
+            unknown_gradient=by_unknowns,
+        )
+
+    def _seen(self, points_cam: Tensor, rotations: Tensor, pixels: Tensor, information: Tensor, cameras: Intrinsics) -> _Seen:
+        """The points as the cameras see them, beside the keypoints; the arguments are those of :meth:`linearise`."""
         x, y, z = points_cam.unbind(-2)
         inverse_depth = inverse_depths(z)
         u, v = x * inverse_depth, y * inverse_depth
-        m = cameras.pixels_with_jacobian(u, v)
-        rx, ry = m.x - pixels[..., 0, :], m.y - pixels[..., 1, :]
+        pixel = cameras.pixels_with_jacobian(u, v)
+        rx, ry = pixel.x - pixels[..., 0, :], pixel.y - pixels[..., 1, :]
         squared_px = rx.square().addcmul_(ry, ry)
         squared = squared_px * information
         weights = information * self.kernel.weight(squared)
         if self.weight != 1.0:
             weights = weights * self.weight
-
-        first, second, third = rotations[..., None].unbind(-3)
-        p = torch.addcmul(first, u.unsqueeze(-2), third, value=-1)
-        q = torch.addcmul(second, v.unsqueeze(-2), third, value=-1)
-        gradient = p * _scaled(weights, m.dx_du, rx, m.dy_du, ry, inverse_depth)
-        gradient.addcmul_(q, _scaled(weights, m.dx_dv, rx, m.dy_dv, ry, inverse_depth))
-
-        weights_at_depth = weights * inverse_depth.square()
-        pp = _scaled(weights_at_depth, m.dx_du, m.dx_du, m.dy_du, m.dy_du)
-        pq = _scaled(weights_at_depth, m.dx_du, m.dx_dv, m.dy_du, m.dy_dv)
-        qq = _scaled(weights_at_depth, m.dx_dv, m.dx_dv, m.dy_dv, m.dy_dv)
-        if exact:
-            bend = 2 * self.weight * (information * inverse_depth).square() * self.kernel.curvature(squared)
-            along_u, along_v = m.dx_du * rx + m.dy_du * ry, m.dx_dv * rx + m.dy_dv * ry
-            uu, uv, vv = cameras.pixel_curvature(u, v, weights_at_depth * rx, weights_at_depth * ry)
-            pp = pp + (bend * along_u * along_u + uu).unsqueeze(-2)
-            pq = pq + (bend * along_u * along_v + uv).unsqueeze(-2)
-            qq = qq + (bend * along_v * along_v + vv).unsqueeze(-2)
-        s, t = p * pp, p * pq
-        s.addcmul_(q, pq)
-        t.addcmul_(q, qq)
-        hessian = p.new_empty(*p.shape[:-2], 6, p.shape[-1])
-        for entries, axis in ((slice(0, 3), 0), (slice(3, 5), 1), (slice(5, 6), 2)):
-            block = hessian[..., entries, :]
-            torch.mul(p[..., axis : axis + 1, :], s[..., axis:, :], out=block)
-            block.addcmul_(q[..., axis : axis + 1, :], t[..., axis:, :])
-        if exact:
-            hessian -= symmetric_product(third.expand_as(p), gradient * inverse_depth.unsqueeze(-2))
-        return CameraPointTerms(
-            cost=self.total(squared, over=2),
-            squares=(weights * squared_px).sum(-1),
-            weights=weights.sum(-1),
-            gradient=gradient,
-            hessian=hessian,
-            unknown=None
-            if unknowns is None
-            else _by_unknowns(unknowns.projection_derivatives(u, v, m), weights, rx, ry, m, p, q, inverse_depth),
-        )
+        a = _by_world(rotations, pixel.dx_du, pixel.dx_dv, u, v, inverse_depth)
+        b = _by_world(rotations, pixel.dy_du, pixel.dy_dv, u, v, inverse_depth)
+        return _Seen(u, v, inverse_depth, pixel, rx, ry, squared_px, squared, weights, a, b)
 
     def slope(
         self,
@@ -238,32 +259,74 @@ def _points_of(columns: slice | Tensor, points: int) -> Tensor:
     return (torch.arange(columns.start, columns.stop) if isinstance(columns, slice) else columns) % points
 
 
-def _by_unknowns(
-    columns: tuple[Tensor, Tensor],
-    weights: Tensor,
-    rx: Tensor,
-    ry: Tensor,
-    m: PixelMap,
-    p: Tensor,
-    q: Tensor,
-    inverse_depth: Tensor,
-) -> UnknownTerms:
+class _Seen(NamedTuple):
+    """N points as C cameras see them; (..., C, N), and (..., C, 3, N) with the axes of the world."""
+
+    u: Tensor
+    v: Tensor
+    """normalised coordinates"""
+    inverse_depth: Tensor
+    pixel: PixelMap
+    rx: Tensor
+    ry: Tensor
+    """projections minus keypoints, pixels"""
+    squared_px: Tensor
+    squared: Tensor
+    """squared residuals, times the information"""
+    weights: Tensor
+    """of least squares re-weighted"""
+    a: Tensor
+    b: Tensor
+    """(..., C, 3, N): derivatives of the pixel's x and y by the point"""
+
+    def curvature(self, rotations: Tensor, gradient: Tensor, cameras: Intrinsics) -> Tensor:
+        """What the curvature of the projection adds to the Hessian by the point, (..., C, 6, N), for a gradient (..., C, 3, N).
+
+        With p and q, the derivatives of u and v times the depth, it is that of the lens, ``[p q] C [p q]^T``, and that of the
+        division by the depth, along the third row of the rotation.
+        """
+        first, second, third = rotations[..., None].unbind(-3)
+        found = -symmetric_product(third.expand_as(gradient), gradient * self.inverse_depth.unsqueeze(-2))
+        if cameras.distortion is None:
+            return found
+        at_depth = self.weights * self.inverse_depth.square()
+        uu, uv, vv = cameras.pixel_curvature(self.u, self.v, at_depth * self.rx, at_depth * self.ry)
+        p, q = first - self.u.unsqueeze(-2) * third, second - self.v.unsqueeze(-2) * third
+        p_half = p * (uu / 2).unsqueeze(-2)
+        return found.add_(symmetric_product(p, p_half.addcmul_(q, uv.unsqueeze(-2)))).add_(
+            symmetric_product(q, q * (vv / 2).unsqueeze(-2))
+        )
+
+
+def _by_world(rotations: Tensor, by_u: Tensor, by_v: Tensor, u: Tensor, v: Tensor, inverse_depth: Tensor) -> Tensor:
+    """Derivative (..., C, 3, N) by the world point of what has the derivatives ``by_u`` and ``by_v`` by (u, v).
+
+    With the rows r of the rotation, u has the derivative ``(r1 - u r3) / z`` and v has ``(r2 - v r3) / z``.
+    """
+    first, second, third = rotations[..., None].unbind(-3)
+    shares = [(row, at, by * inverse_depth) for row, at, by in ((first, u, by_u), (second, v, by_v)) if _matters(by)]
+    if not shares:
+        return u.unsqueeze(-2) * torch.zeros_like(third)
+    row, at, along = shares[0]
+    found, along_depth = row * along.unsqueeze(-2), along * at
+    for row, at, along in shares[1:]:
+        found.addcmul_(row, along.unsqueeze(-2))
+        along_depth.addcmul_(along, at)
+    return found.addcmul_(third, along_depth.unsqueeze(-2), value=-1)
+
+
+def _matters(derivative: Tensor) -> bool:
+    """False for the same zero at all points."""
+    return derivative.shape[-1] != 1 or bool(derivative.any())
+
+
+def _by_unknowns(columns: tuple[Tensor, Tensor], at: _Seen) -> UnknownTerms:
     """The terms by columns (..., C, k, N): the gradient's with a column in place of the residual."""
     ex, ey = columns
-    wx, wy = weights.unsqueeze(-2) * ex, weights.unsqueeze(-2) * ey
-    along_p, along_q = (
-        (by_x.unsqueeze(-2) * wx).addcmul_(by_y.unsqueeze(-2), wy) * inverse_depth.unsqueeze(-2)
-        for by_x, by_y in ((m.dx_du, m.dy_du), (m.dx_dv, m.dy_dv))
-    )
-    coupling = p.unsqueeze(-3) * along_p.unsqueeze(-2)
+    wx, wy = at.weights.unsqueeze(-2) * ex, at.weights.unsqueeze(-2) * ey
+    coupling = at.a.unsqueeze(-3) * wx.unsqueeze(-2)
     return UnknownTerms(
-        gradient=(wx @ rx.unsqueeze(-1) + wy @ ry.unsqueeze(-1))[..., 0],
+        gradient=(wx @ at.rx.unsqueeze(-1) + wy @ at.ry.unsqueeze(-1))[..., 0],
         hessian=wx @ ex.mT + wy @ ey.mT,
-        coupling=coupling.addcmul_(q.unsqueeze(-3), along_q.unsqueeze(-2)),
+        coupling=coupling.addcmul_(at.b.unsqueeze(-3), wy.unsqueeze(-2)),
     )
-
-
-def _scaled(weights: Tensor, a: Tensor, b: Tensor, c: Tensor, d: Tensor, factor: Tensor | None = None) -> Tensor:
-    """``weights (a b + c d) factor`` as (..., C, 1, N)."""
-    scaled = weights * torch.addcmul(a * b, c, d)
-    return (scaled if factor is None else scaled * factor).unsqueeze(-2)

@@ -16,6 +16,7 @@ from torchstickcal.model.measurements import Measurements
 from torchstickcal.model.objective import Objective
 from torchstickcal.model.state import State
 from torchstickcal.model.unknowns import REFINEMENTS, ImageMotion, RigUnknowns
+from torchstickcal.solvers.elimination.evaluated import Gradient
 from torchstickcal.solvers.elimination.normal_equations import NormalEquations
 
 CHOICES = [(name,) for name in REFINEMENTS] + [
@@ -104,6 +105,12 @@ def test_step_is_that_of_the_full_system(disturbed: tuple[Measurements, State], 
     assert float(step.predicted_decrease) == pytest.approx(predicted, rel=1e-8)
     terms = objective.terms(state)
     assert float(system.cost) == pytest.approx(float(sum(terms.values())), rel=1e-12)
+
+    alone, (count, tangents) = Gradient(objective, state, True), (unknowns.count, 18)
+    assert float(alone.cost) == pytest.approx(float(system.cost), rel=1e-12)
+    scale = 1e-9 * float(gradient[: tangents + count].abs().max())
+    torch.testing.assert_close(alone.camera_gradient.flatten(), gradient[:tangents], rtol=1e-9, atol=scale)
+    torch.testing.assert_close(alone.unknown_gradient[0], gradient[tangents : tangents + count], rtol=1e-9, atol=scale)
 
 
 @pytest.mark.parametrize("lens", LENSES)

@@ -88,6 +88,22 @@ def test_jacobian_is_autograds(lens: str):
 
 
 @pytest.mark.parametrize("lens", LENSES)
+def test_curvature_is_autograds(lens: str):
+    u, v = (0.5 * points()[..., :2]).unbind(-1)
+    along_x, along_y = points()[..., 1], points()[..., 2]
+    found = cameras(lens).pixel_curvature(u, v, along_x, along_y)
+    u, v = u.requires_grad_(), v.requires_grad_()
+    x, y = cameras(lens).pixels(u, v)
+    first = torch.autograd.grad((along_x * x + along_y * y).sum(), (u, v), create_graph=True)
+    if lens == "perfect":
+        assert not any(bool(second.any()) for second in found)
+        return
+    uu, uv = torch.autograd.grad(first[0].sum(), (u, v), retain_graph=True)
+    (vv,) = torch.autograd.grad(first[1].sum(), v)
+    torch.testing.assert_close(found, (uu, uv, vv), rtol=1e-9, atol=1e-8)
+
+
+@pytest.mark.parametrize("lens", LENSES)
 def test_undistortion_inverts_projection(lens: str):
     x = points()
     rays = cameras(lens).undistort(cameras(lens).project(x))

@@ -83,8 +83,8 @@ def check(found: list[Part], hessian: Tensor, dense: Tensor) -> None:
     for part in found:
         columns = part.columns
         elimination = part.eliminate(hessian[None, :, columns])
-        rows, solved = elimination.forward_solve_cross(cross[..., columns], points[..., columns], gradient[..., columns])
-        both = torch.cat([rows, solved[:, None]], dim=1)[0]
+        rows = elimination.forward_solve_cross(cross[..., columns], None, None, points[..., columns])
+        both = torch.cat([rows, elimination.forward_solve(gradient[..., columns])[:, None]], dim=1)[0]
         reduced += both @ both.mT
         solution[..., columns] = elimination.solve(gradient[..., columns])
     torch.testing.assert_close(reduced, expected, rtol=1e-10, atol=1e-10 * float(expected.abs().max()))

@@ -22,6 +22,7 @@ from torchstickcal.losses.reprojection import reprojection_residuals
 from torchstickcal.model.measurements import Measurements
 from torchstickcal.model.objective import Objective
 from torchstickcal.model.state import State
+from torchstickcal.solvers.elimination.evaluated import Gradient
 from torchstickcal.solvers.elimination.normal_equations import NormalEquations
 
 LOSSES: dict[str, dict[str, Loss]] = {
@@ -167,24 +168,31 @@ def test_linearised_cost_and_gradient_agree_with_autograd(disturbed: tuple[Measu
     objective = Objective(measurements, losses)
     points = state.points.clone().requires_grad_()
     terms = objective.terms(dataclasses.replace(state, points=points))
-    system = NormalEquations(objective, state, cameras_free=True)
-    for name, value in terms.items():
-        assert float(system.terms[name]) == pytest.approx(float(value.detach()), rel=1e-12)
     (gradient,) = torch.autograd.grad(torch.stack(list(terms.values())).sum(), points)
-    torch.testing.assert_close(2 * system.point_gradient, gradient, rtol=1e-9, atol=1e-9 * float(gradient.abs().max()))
+    system = NormalEquations(objective, state, cameras_free=True)
+    alone = Gradient(objective, state, cameras_free=True)
+    for found in (system, alone):
+        for name, value in terms.items():
+            assert float(found.terms[name]) == pytest.approx(float(value.detach()), rel=1e-12)
+        torch.testing.assert_close(2 * found.point_gradient, gradient, rtol=1e-9, atol=1e-9 * float(gradient.abs().max()))
+    scale = float(system.camera_gradient.abs().max())
+    torch.testing.assert_close(alone.camera_gradient, system.camera_gradient, rtol=1e-10, atol=1e-12 * scale)
+    torch.testing.assert_close(alone.reprojection_px, system.reprojection_px)
 
 
 @pytest.mark.parametrize("losses", LOSSES.values(), ids=LOSSES.keys())
-@pytest.mark.parametrize("cached", [True, False], ids=["cached", "computed again"])
+@pytest.mark.parametrize("kept", ["rows", "blocks", "nothing"])
 def test_splitting_into_parts_does_not_change_the_step(
-    disturbed: tuple[Measurements, State], losses: dict[str, Loss], cached: bool, monkeypatch: pytest.MonkeyPatch
+    disturbed: tuple[Measurements, State], losses: dict[str, Loss], kept: str, monkeypatch: pytest.MonkeyPatch
 ):
     measurements, state = disturbed
     objective = Objective(measurements, losses)
     whole = NormalEquations(objective, state, True, 1e-3).step()
     monkeypatch.setattr("torchstickcal.model.measurements._CHUNK_KEYPOINTS", {"cpu": 200})
     monkeypatch.setattr("torchstickcal.solvers.elimination.parts._MAX_TRACK_POINTS", 90)
-    if not cached:
+    if kept != "rows":
+        monkeypatch.setattr("torchstickcal.solvers.elimination.normal_equations._MAX_SOLVED_BYTES", 0)
+    if kept == "nothing":
         monkeypatch.setattr("torchstickcal.solvers.elimination.normal_equations._MAX_CACHED_BYTES", 0)
     assert len(measurements.chunks()) > 10
     parts = NormalEquations(objective, state, True, 1e-3).step()

@@ -315,6 +315,9 @@ def test_closed_forms_are_the_automatic_ones(disturbed: tuple[Measurements, Stat
         by_hand, automatic = loss.linearise(*arguments), CameraPointLoss.linearise(loss, *arguments)
         for found, expected in zip(by_hand[:-1], automatic[:-1], strict=True):
             torch.testing.assert_close(found, expected, rtol=1e-9, atol=1e-9 * float(expected.abs().max()))
+    slopes = (points_cam, rotations, pixels, information, m.cameras)
+    for found, expected in zip(loss.slopes(*slopes)[:-1], CameraPointLoss.slopes(loss, *slopes)[:-1], strict=True):
+        torch.testing.assert_close(found, expected, rtol=1e-9, atol=1e-9 * float(expected.abs().max()))
     moved = torch.randn(points_cam.shape, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     along = (points_cam, moved, pixels, information, m.cameras)
     torch.testing.assert_close(loss.slope(*along), CameraPointLoss.slope(loss, *along), rtol=1e-11, atol=0)

@@ -12,6 +12,7 @@ from torchstickcal.model.measurements import Measurements
 from torchstickcal.model.objective import Objective
 from torchstickcal.model.state import State
 from torchstickcal.solvers import IterationRecord, Stop, Termination, gradients, solver
+from torchstickcal.solvers.elimination.normal_equations import NormalEquations
 
 LOSSES: dict[str, dict[str, Loss]] = {
     "whitened": {"reprojection": ReprojectionLoss(1.0, kernel=GemanMcClure(8.0)), "length": StickLengthLoss(0.001)},
@@ -42,6 +43,24 @@ def test_both_solvers_find_the_same_minimum(disturbed: tuple[Measurements, State
     assert theirs.stops[0].converged
     assert ours.iterations[0][-1].cost == pytest.approx(theirs.iterations[0][-1].cost, rel=1e-8)
     assert ours.iterations[0][-1].cost < ours.iterations[0][0].cost
+
+
+@pytest.mark.parametrize("losses", LOSSES.values(), ids=LOSSES.keys())
+@pytest.mark.parametrize("tolerance", [1e-2, 1e-5, 1e-9])
+def test_the_last_step_is_confirmed_by_its_cost_alone(
+    disturbed: tuple[Measurements, State], losses: dict[str, Loss], tolerance: float, monkeypatch: pytest.MonkeyPatch
+):
+    """One system less than states, and the same end as with the system of every state, but for a negligible step."""
+    objective = Objective(disturbed[0], losses)
+    built: list[NormalEquations] = []
+    build = NormalEquations.__init__
+    monkeypatch.setattr(NormalEquations, "__init__", lambda self, *given: built.append(self) or build(self, *given))
+    outcome = run("gauss_newton", objective, disturbed[1], Termination(cost_tolerance=tolerance, camera_tolerance=0.0))
+    states = outcome.iterations[0]
+    assert outcome.stops[0].converged
+    assert len(built) == len(states) - 1
+    exact = run("gauss_newton", objective, disturbed[1]).iterations[0][-1].cost
+    assert exact <= states[-1].cost <= exact * (1 + 10 * tolerance)
 
 
 @pytest.mark.parametrize("name", ["gauss_newton", "lbfgs"])

@@ -8,14 +8,22 @@ import os
 import subprocess
 import sys
 import threading
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 import torch
 
-from torchstickcal import calibrate
+from torchstickcal import calibrate, workers
 from torchstickcal.lazy import cached_property
+from torchstickcal.losses import Loss, ReprojectionLoss, SmoothnessLoss
+from torchstickcal.model.measurements import Measurements
+from torchstickcal.model.objective import Objective
+from torchstickcal.model.state import State
 from torchstickcal.simulate import golf_session
-from torchstickcal.workers import map_on_workers, on_worker
+from torchstickcal.solvers.elimination.evaluated import Gradient
+from torchstickcal.solvers.elimination.normal_equations import NormalEquations
+from torchstickcal.workers import map_on_workers, map_with_idle_workers, on_worker
 
 CPU = torch.device("cpu")
 
@@ -41,6 +49,51 @@ def test_order_nested_calls_and_errors():
     assert map_on_workers(CPU, lambda k: on_worker(CPU, lambda: 2 * k), range(20)) == list(range(0, 40, 2))
     with pytest.raises(ZeroDivisionError):
         on_worker(CPU, lambda: 1 / 0)
+
+
+@pytest.fixture
+def two_workers(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    with ThreadPoolExecutor(2, initializer=workers._initialise_worker) as pool:
+        monkeypatch.setattr(workers, "_pool", pool)
+        yield
+
+
+@pytest.mark.usefixtures("two_workers")
+def test_idle_workers_help():
+    both = threading.Barrier(2, timeout=20)
+    assert on_worker(CPU, map_with_idle_workers, lambda _: both.wait() >= 0, range(2)) == [True, True]
+    assert on_worker(CPU, map_with_idle_workers, lambda k: 2 * k, range(50)) == list(range(0, 100, 2))
+    with pytest.raises(ZeroDivisionError):
+        on_worker(CPU, map_with_idle_workers, lambda k: 1 // (k - 3), range(9))
+
+
+@pytest.mark.usefixtures("two_workers")
+def test_busy_workers_do_not_wait_for_each_other():
+    both = threading.Barrier(2, timeout=20)
+
+    def busy(first: int) -> list[int]:
+        both.wait()  # no worker is idle
+        return map_with_idle_workers(lambda k: first + k, range(20))
+
+    assert map_on_workers(CPU, busy, [0, 100]) == [list(range(20)), list(range(100, 120))]
+
+
+@pytest.mark.usefixtures("two_workers")
+@pytest.mark.parametrize("losses", [{"r": ReprojectionLoss()}, {"r": ReprojectionLoss(), "s": SmoothnessLoss(0.05)}])
+def test_help_does_not_change_a_bit(
+    disturbed: tuple[Measurements, State], losses: dict[str, Loss], monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.setattr("torchstickcal.model.measurements._CHUNK_KEYPOINTS", {"cpu": 200})
+    monkeypatch.setattr("torchstickcal.solvers.elimination.parts._MAX_TRACK_POINTS", 90)
+    m, state = disturbed
+
+    def step() -> tuple[torch.Tensor, ...]:
+        system = NormalEquations(Objective(m, losses), state, True, 1e-5)
+        value = Gradient(Objective(m, losses), state, True)
+        return *system.step(), value.cost, value.point_gradient, value.camera_gradient, m.squared_residuals(state)
+
+    for alone, helped in zip(step(), on_worker(CPU, step), strict=True):
+        assert torch.equal(alone, helped)
 
 
 def _threads_in_child(queue: multiprocessing.SimpleQueue[int]) -> None:

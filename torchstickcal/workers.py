@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import os
 import threading
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import ParamSpec, TypeVar
 
@@ -43,6 +43,30 @@ def map_on_workers(device: torch.device, function: Callable[[_Item], _Result], i
     if device.type != "cpu" or _is_worker():
         return list(map(function, items))
     return list(_workers().map(_with_grad_mode(function), items))
+
+
+def map_with_idle_workers(function: Callable[[_Item], _Result], items: Sequence[_Item]) -> list[_Result]:
+    """The results of a function for several parts of one worker's work. Idle workers take some of them.
+
+    The worker itself never waits for another one to become idle. Outside the workers, the calling thread does everything.
+    """
+    if not _is_worker() or _pool is None or len(items) < 2:
+        return list(map(function, items))
+    results: dict[int, _Result] = {}
+    open_items = iter(range(len(items)))  # each is taken by one thread: the step of an iterator cannot be interrupted
+
+    def work() -> None:
+        for number in open_items:
+            results[number] = function(items[number])
+
+    helpers = [_pool.submit(_with_grad_mode(work)) for _ in range(min(_pool._max_workers, len(items)) - 1)]
+    try:
+        work()
+    finally:
+        for helper in helpers:
+            if not helper.cancel():
+                helper.result()
+    return [results[number] for number in range(len(items))]
 
 
 def _is_worker() -> bool:

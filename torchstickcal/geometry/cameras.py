@@ -169,8 +169,8 @@ class Intrinsics:
         lens = self.distort_with_jacobian(u, v)
         return PixelMap(
             *self._to_pixels(lens.u, lens.v),
-            dx_du=fx * lens.du_du + skew * lens.dv_du,
-            dx_dv=fx * lens.du_dv + skew * lens.dv_dv,
+            dx_du=torch.addcmul(fx * lens.du_du, skew, lens.dv_du),
+            dx_dv=torch.addcmul(fx * lens.du_dv, skew, lens.dv_dv),
             dy_du=fy * lens.dv_du,
             dy_dv=fy * lens.dv_dv,
         )
@@ -180,6 +180,26 @@ class Intrinsics:
         if self.distortion is None:
             zero = torch.zeros_like(u)
             return zero, zero, zero
+        if self.fisheye or self._has_denominator:
+            return self._curvature_by_autograd(u, v, along_x, along_y)
+        fx, skew, _, fy, _ = self._pixel_map(u.ndim)
+        _, k2, p1, p2, k3, *_ = self._coefficients(u.ndim)
+        _, slope, _, _, r2 = self._rational(u, v)
+        a, b = along_x * fx, torch.addcmul(along_y * fy, along_x, skew)
+        # Along u the scale of the lens has the second derivative by_u, along v it has by_v; what is mixed is the same for both.
+        bend, twice_slope = _polynomial(r2, 8 * k2, 24 * k3), 2 * slope
+        by_u, by_v = (torch.addcmul(twice_slope, bend, x * x) for x in (u, v))
+        mixed_u, mixed_v = torch.addcmul(2 * p1, v, by_u), torch.addcmul(2 * p2, u, by_v)
+        own_u = torch.addcmul(6 * p2, u, torch.add(by_u, twice_slope, alpha=2))
+        own_v = torch.addcmul(6 * p1, v, torch.add(by_v, twice_slope, alpha=2))
+        return (
+            torch.addcmul(a * own_u, b, mixed_u),
+            torch.addcmul(a * mixed_u, b, mixed_v),
+            torch.addcmul(a * mixed_v, b, own_v),
+        )
+
+    def _curvature_by_autograd(self, u: Tensor, v: Tensor, along_x: Tensor, along_y: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """:meth:`pixel_curvature` of any lens."""
         with torch.enable_grad():
             u, v = u.detach().requires_grad_(), v.detach().requires_grad_()
             m = self.pixels_with_jacobian(u, v)
@@ -212,9 +232,9 @@ class Intrinsics:
         if self.fisheye:
             scale, _ = self._fisheye(u, v)
             return scale * u, scale * v
-        radial, _, p1, p2, r2 = self._rational(u, v)
-        uv = 2 * u * v
-        distorted = u * radial + p1 * uv + p2 * (r2 + 2 * u * u), v * radial + p1 * (r2 + 2 * v * v) + p2 * uv
+        radial, _, p1, p2, r2 = self._rational(u, v, slope=False)
+        scale = torch.addcmul(torch.addcmul(radial, 2 * p1, v), 2 * p2, u)
+        distorted = torch.addcmul(p2 * r2, u, scale), torch.addcmul(p1 * r2, v, scale)
         if self._has_prism:
             s1, s2, s3, s4 = self._coefficients(u.ndim)[8:12]
             distorted = distorted[0] + r2 * (s1 + r2 * s2), distorted[1] + r2 * (s3 + r2 * s4)
@@ -230,15 +250,18 @@ class Intrinsics:
             mixed = slope * u * v
             return Distorted(scale * u, scale * v, scale + slope * u * u, mixed, mixed, scale + slope * v * v)
         radial, slope, p1, p2, r2 = self._rational(u, v)
-        uv = 2 * u * v
-        mixed = slope * uv + 2 * p1 * u + 2 * p2 * v
+        twice_p1, twice_p2 = 2 * p1, 2 * p2
+        scale = torch.addcmul(torch.addcmul(radial, twice_p1, v), twice_p2, u)
+        twice_slope = 2 * slope
+        along_u, along_v = twice_slope * u, twice_slope * v
+        mixed = torch.addcmul(torch.addcmul(along_u * v, twice_p1, u), twice_p2, v)
         found = Distorted(
-            u * radial + p1 * uv + p2 * (r2 + 2 * u * u),
-            v * radial + p1 * (r2 + 2 * v * v) + p2 * uv,
-            radial + 2 * slope * u * u + 2 * p1 * v + 6 * p2 * u,
+            torch.addcmul(p2 * r2, u, scale),
+            torch.addcmul(p1 * r2, v, scale),
+            torch.addcmul(scale, u, along_u + 2 * twice_p2),
             mixed,
             mixed,
-            radial + 2 * slope * v * v + 6 * p1 * v + 2 * p2 * u,
+            torch.addcmul(scale, v, along_v + 2 * twice_p1),
         )
         if self._has_prism:
             found = self._with_prism(u, v, r2, found)
@@ -314,7 +337,7 @@ class Intrinsics:
 
     def _to_pixels(self, u: Tensor, v: Tensor) -> tuple[Tensor, Tensor]:
         fx, skew, cx, fy, cy = self._pixel_map(u.ndim)
-        return fx * u + skew * v + cx, fy * v + cy
+        return torch.addcmul(torch.addcmul(cx, fx, u), skew, v), torch.addcmul(cy, fy, v)
 
     @property
     def is_tilted(self) -> bool:
@@ -347,18 +370,19 @@ class Intrinsics:
         padded = torch.nn.functional.pad(self.distortion, (0, padding))
         return list(_broadcast(padded.movedim(-1, 0), ndim + 1))
 
-    def _rational(self, u: Tensor, v: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
-        """Radial factor, its derivative by r^2, p1, p2 and r^2."""
+    def _rational(self, u: Tensor, v: Tensor, slope: bool = True) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+        """Radial factor, its derivative by r^2 (if wanted), p1, p2 and r^2."""
         k1, k2, p1, p2, k3, k4, k5, k6 = self._coefficients(u.ndim)[:8]
-        r2 = u * u + v * v
-        numerator = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
-        numerator_slope = k1 + r2 * (2 * k2 + 3 * r2 * k3)
-        if not self._has_denominator:
-            return numerator, numerator_slope, p1, p2, r2
-        denominator = 1 + r2 * (k4 + r2 * (k5 + r2 * k6))
-        radial = numerator / denominator
-        denominator_slope = k4 + r2 * (2 * k5 + 3 * r2 * k6)
-        return radial, (numerator_slope - radial * denominator_slope) / denominator, p1, p2, r2
+        one, r2 = torch.ones_like(k1), torch.addcmul(u * u, v, v)
+        radial, by_r2 = _polynomial(r2, one, k1, k2, k3), r2
+        if slope:
+            by_r2 = _polynomial(r2, k1, 2 * k2, 3 * k3)
+        if self._has_denominator:
+            denominator = _polynomial(r2, one, k4, k5, k6)
+            radial = radial / denominator
+            if slope:
+                by_r2 = (by_r2 - radial * _polynomial(r2, k4, 2 * k5, 3 * k6)) / denominator
+        return radial, by_r2, p1, p2, r2
 
     def _fisheye(self, u: Tensor, v: Tensor) -> tuple[Tensor, Tensor]:
         """Scale ``theta_d / r`` and its derivative by r, divided by r."""
@@ -386,6 +410,14 @@ class Intrinsics:
         folded = (growth <= 0) | ~growth.isfinite()
         limits = torch.where(folded, radii, torch.inf)
         return limits.amin(dim=-1)
+
+
+def _polynomial(x: Tensor, *coefficients: Tensor) -> Tensor:
+    """``c0 + c1 x + c2 x^2 + ...``"""
+    *others, value = coefficients
+    for coefficient in reversed(others):
+        value = torch.addcmul(coefficient, x, value)
+    return value
 
 
 def inverse_depths(depth: Tensor) -> Tensor:

@@ -205,6 +205,8 @@ def _pooled(products: Tensor, pairs: Tensor, widths: Tensor, held: Tensor | None
         widths: (bins,), numbers of lags.
         held: (B, bins), in which bins there is such a correlation; None to decide.
     """
+    if held is None and not bool((products > _SIGNIFICANT * pairs.clamp_min(0.1).sqrt()).any()):
+        return torch.zeros_like(products), torch.ones_like(products[:, :1]), torch.zeros_like(products, dtype=torch.bool)
     values: list[Tensor] = []
     decided: list[Tensor] = []
     time, squares = (torch.ones_like(products[:, :1]) for _ in range(2))

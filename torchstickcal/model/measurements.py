@@ -20,6 +20,7 @@ from torchstickcal.model.state import State
 from torchstickcal.model.unknowns import Columns, ImageMotion, RigUnknowns
 from torchstickcal.observations import Observations
 from torchstickcal.stick import point_index
+from torchstickcal.workers import map_with_idle_workers
 
 _CHUNK_KEYPOINTS = {"cpu": 32_000, "cuda": 1_000_000}
 """Keypoints worked on at a time. What a CPU works on stays in its cache; elsewhere an operation should be worth its launch."""
@@ -170,19 +171,26 @@ class Measurements:
 
         Infinite where a keypoint is not seen or its point lies behind the camera.
         """
-        squared = torch.empty_like(self.confidence)
-        for columns, residuals, depth in self.residuals(state):
+        squared, cameras = torch.empty_like(self.confidence), self.cameras_at(state)
+
+        def fill(columns: slice) -> None:
+            residuals, depth = self._residuals(state, cameras, columns)
             confidence = self.confidence[..., columns]
             distance = residuals.square().sum(-2) * confidence
             squared[..., columns] = distance.where((confidence > 0) & (depth > 0), torch.inf)
+
+        map_with_idle_workers(fill, self.chunks())
         return squared
 
     def residuals(self, state: State) -> Iterator[tuple[slice, Tensor, Tensor]]:
         """Projections minus keypoints (B, C, 2, n), pixels, and the points' depths (B, C, n), metres, by chunks of columns."""
         cameras = self.cameras_at(state)
         for columns in self.chunks():
-            x, y, z = state.in_cameras(columns, self.pixels.dtype).unbind(-2)
-            yield columns, torch.stack(cameras.project_components(x, y, z), dim=-2) - self.pixels_at(state, columns), z
+            yield columns, *self._residuals(state, cameras, columns)
+
+    def _residuals(self, state: State, cameras: Intrinsics, columns: slice) -> tuple[Tensor, Tensor]:
+        x, y, z = state.in_cameras(columns, self.pixels.dtype).unbind(-2)
+        return torch.stack(cameras.project_components(x, y, z), dim=-2) - self.pixels_at(state, columns), z
 
     def cameras_at(self, state: State) -> Intrinsics:
         """The cameras as a state has them, in the dtype of the pixels."""
@@ -244,8 +252,9 @@ class Measurements:
 
     def chunks(self) -> list[slice]:
         """Slices of the columns, whole frames each, small enough to be worked on at a time."""
-        keypoints_per_frame = self.sessions * self.num_cameras * self.points_per_frame
-        width = self.points_per_frame * max(1, self.chunk_keypoints // keypoints_per_frame)
+        most_frames = max(1, self.chunk_keypoints // max(1, self.sessions * self.num_cameras * self.points_per_frame))
+        chunks = -(-self.frames // most_frames)
+        width = self.points_per_frame * -(-self.frames // max(1, chunks))  # of equal size, for threads of equal speed
         return [slice(start, min(start + width, self.num_columns)) for start in range(0, self.num_columns, width)]
 
     @property

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
+
 import torch
 from torch import Tensor
 
@@ -140,6 +142,7 @@ def _remaining_share(views: Tensor) -> Tensor:
     return (2 * views - 3).clamp_min(1) / (2 * views).clamp_min(4)
 
 
+@lru_cache
 def _truncated_moments(cameras: int, cut: float) -> Tensor:
     """Second moments of residuals below the cut, as fractions of the full moments, by the number of views from 0 to C."""
     half = _degrees(cameras) / 2
@@ -147,6 +150,7 @@ def _truncated_moments(cameras: int, cut: float) -> Tensor:
     return torch.special.gammainc(half + 1, limit) / torch.special.gammainc(half, limit)
 
 
+@lru_cache
 def _lower_quartiles(cameras: int) -> Tensor:
     """Lower quartiles of squared residuals with mean 2, by the number of views from 0 to C (Wilson and Hilferty 1931)."""
     spread = 2 / (9 * _degrees(cameras))

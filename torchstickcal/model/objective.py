@@ -18,7 +18,7 @@ from torchstickcal.geometry.cameras import Intrinsics, PixelMap
 from torchstickcal.geometry.symmetric import IDENTITY, inverse_diagonal
 from torchstickcal.lazy import cached_property
 from torchstickcal.losses import CameraPointLoss, FrameLoss, Loss, TrackLoss
-from torchstickcal.losses.camera_point import CameraPointTerms, UnknownTerms
+from torchstickcal.losses.camera_point import CameraPointSlopes, CameraPointTerms, UnknownTerms
 from torchstickcal.losses.frame import FrameTerms
 from torchstickcal.losses.track import TrackTerms
 from torchstickcal.model.measurements import Measurements
@@ -170,6 +170,29 @@ class Objective:
             if unknowns is not None and exact:
                 terms = terms._replace(unknown=self._exact_by_unknowns(loss, state, columns, information))
             found[name] = terms
+        return found
+
+    def slopes_of_chunk(
+        self, state: State, columns: Columns, by_unknowns: bool = True, dtype: torch.dtype | None = None
+    ) -> dict[str, CameraPointSlopes]:
+        """The first derivatives of the camera-point losses at some of the columns; the arguments are as above.
+
+        Args:
+            state: where.
+            columns: the columns.
+            by_unknowns: whether also those by the cameras' further unknowns.
+            dtype: in which they are computed; None for that of the keypoints.
+        """
+        m = self.measurements
+        at, confidence = self._unknowns_at(state, columns), m.confidence[..., columns]
+        dtype = at.pixels.dtype if dtype is None else dtype
+        points_cam, rotations = state.in_cameras(columns, dtype), state.rotations.to(dtype)
+        found: dict[str, CameraPointSlopes] = {}
+        for name, loss in self._camera_point.items():
+            information = confidence * self._information[name][..., columns]
+            loss = loss.of_columns(columns, m.points_per_frame)
+            unknowns = at.if_any if by_unknowns else None
+            found[name] = loss.slopes(points_cam, rotations, at.pixels, information, at.cameras, unknowns)
         return found
 
     @torch.enable_grad()

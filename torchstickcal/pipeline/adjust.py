@@ -45,6 +45,9 @@ for its reverse; and ratio of two such quartiles that says so."""
 _EXACT = 1e-5
 """Cost tolerance of the stage for this comparison."""
 _MOST_SORTED = 100_003
+_ROUGHLY, _NEARLY = 1e-3, 1e-6
+"""Relative decrease of the cost from which on Newton's method can take over; and from which on what it still changes is
+negligible."""
 _SETTLED = 0.1
 """Relative change of the numbers of keypoints that count as one, below which a stage need not be repeated with new ones."""
 
@@ -374,7 +377,7 @@ def adjust_again(adjustment: Adjustment, run: Run, refined: Sequence[str]) -> Ad
 def adjust_points(adjustment: Adjustment, run: Run) -> Adjustment:
     """The stages in which the cameras are fixed."""
     for named in run.point_stages.items():
-        before, adjustment = adjustment, through([named], adjustment, run, roughly=run.to_rounding)
+        before, adjustment = adjustment, through([named], adjustment, run, _ROUGHLY if run.to_rounding else 0.0)
         if run.to_rounding:
             adjustment = _finished(adjustment, run, named, before.state, polished)
     return adjustment
@@ -399,8 +402,10 @@ def points_used(observations: Observations, config: Config) -> list[int] | None:
 def _with_last_camera_stage(adjustment: Adjustment, run: Run) -> Adjustment:
     """After the last stage that estimates cameras, with clocks and noise that agree with what it found."""
     *_, last = run.camera_stages.items()
-    roughly = run.to_rounding and run.settles and not adjustment.asynchronous
-    return _settled(_synchronised(through([last], adjustment, run, roughly), run), run)
+    least = 0.0
+    if run.settles and not adjustment.asynchronous:
+        least = _ROUGHLY if run.to_rounding else _NEARLY
+    return _settled(_synchronised(through([last], adjustment, run, least), run), run)
 
 
 def _settled(adjustment: Adjustment, run: Run) -> Adjustment:
@@ -441,19 +446,19 @@ def _finished(
     return replace(adjustment, results=earlier).ended(result).replaced(found, finished)
 
 
-def through(stages: Iterable[tuple[str, Stage]], adjustment: Adjustment, run: Run, roughly: bool = False) -> Adjustment:
+def through(stages: Iterable[tuple[str, Stage]], adjustment: Adjustment, run: Run, least: float = 0.0) -> Adjustment:
     """After some stages. One in which keypoints count as fewer is repeated, until what they count no longer changes.
 
     Errors that last are hidden in the cameras, as long as points with such errors determine them.
     """
     for name, stage in stages:
-        adjustment = adjustment.ended(run_stage(name, stage, adjustment.measurements, adjustment.state, run, roughly))
+        adjustment = adjustment.ended(run_stage(name, stage, adjustment.measurements, adjustment.state, run, least))
         before, times = torch.ones_like(adjustment.last.correlation_frames), adjustment.last.correlation_frames
         for _ in range(_MOST_ROUNDS - 1):
             unchanged = ((times / before).log().abs() < _SETTLED).flatten(1).all(1)
             if bool(unchanged.all()):
                 break
-            again = adjustment.ended(run_stage(name, stage, adjustment.measurements, adjustment.state, run, roughly))
+            again = adjustment.ended(run_stage(name, stage, adjustment.measurements, adjustment.state, run, least))
             adjustment = again.replaced(unchanged, adjustment)
             before, times = times, adjustment.last.correlation_frames
     return adjustment

@@ -21,10 +21,8 @@ from torchstickcal.pipeline.run import Run
 from torchstickcal.pipeline.scale import outvoted_factors, rulers, scale_factors
 from torchstickcal.solvers import StageRecord, Stop, Termination, solver
 
-_RESOLUTION = {torch.float64: 0.0, torch.float32: 1e-6}
+_RESOLUTION = {torch.float64: 0.0, torch.float32: 1e-7}
 """Relative decrease of the cost that can be distinguished from rounding."""
-_ROUGHLY = 1e-3
-"""Relative decrease of the cost from which on a state is near the minimum."""
 _LEAST_AGREEING_SHARE = 0.15
 """Share of a camera's keypoints that must agree with the other cameras. Sound cameras have more than 0.8, cameras that see
 another scene 0.3 to 0.4; by chance some always agree."""
@@ -90,7 +88,7 @@ def run_stage(
     measurements: Measurements,
     state: State,
     run: Run,
-    roughly: bool = False,
+    least: float = 0.0,
 ) -> StageResult:
     """Run one stage from a state, for all sessions.
 
@@ -100,7 +98,7 @@ def run_stage(
         measurements: the sessions.
         state: where it starts.
         run: what all steps share.
-        roughly: whether it is enough to come near the minimum.
+        least: relative decrease of the cost from which on Gauss-Newton is near enough to the minimum.
 
     Raises:
         CalibrationError: if it does not converge in a session, and the run must.
@@ -120,7 +118,7 @@ def run_stage(
     losses, levels, gates = noise.decided(measurements, state, squared_residuals, chosen)
     del squared_residuals
     objective = Objective(measurements, losses)
-    least = _ROUGHLY if roughly and run.config.solver == "gauss_newton" else _RESOLUTION[measurements.pixels.dtype]
+    least = max(least if run.config.solver == "gauss_newton" else 0.0, _RESOLUTION[measurements.pixels.dtype])
     outcome = solver(run.config.solver)(
         objective,
         state,

@@ -7,12 +7,15 @@ own step, has its own damping, and stops by its own criterion.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import torch
+from torch import Tensor
 
 from torchstickcal.model.objective import Objective
 from torchstickcal.model.state import State
 from torchstickcal.solvers.base import IterationRecord, Listener, Outcome, Stop, Termination
+from torchstickcal.solvers.elimination.evaluated import Gradient
 from torchstickcal.solvers.elimination.normal_equations import NormalEquations, Step
 
 _INITIAL_DAMPING = 1e-5
@@ -51,7 +54,7 @@ def gauss_newton(
     steps_m = [0.0] * len(sessions)
     while True:
         damping = torch.tensor([session.damping for session in sessions], dtype=torch.float64, device=device)
-        system = NormalEquations(objective, trial, cameras_free, damping)
+        system = _system(objective, trial, cameras_free, damping, sessions)
         accepted = [session.accept(cost) for session, cost in zip(sessions, system.cost.tolist(), strict=True)]
         if any(accepted):
             best = trial if all(accepted) else best.replaced(torch.tensor(accepted, device=device), trial)
@@ -61,7 +64,7 @@ def gauss_newton(
                     records[number].append(record)
                     listener(record)
         has_trial = [False] * len(sessions)
-        if any(session.at_best for session in sessions):
+        if isinstance(system, NormalEquations) and any(session.at_best for session in sessions):
             step = system.step()
             results = (step.solved, step.predicted_decrease, step.damped_share, step.camera_sigmas)
             for session, *result in zip(sessions, *(result.tolist() for result in results), strict=True):
@@ -78,6 +81,17 @@ def gauss_newton(
             trial = best.replaced(torch.tensor(has_trial, device=device), trial) if any(has_trial) else best
 
 
+def _system(
+    objective: Objective, trial: State, cameras_free: bool, damping: Tensor, sessions: Sequence[_SessionControl]
+) -> NormalEquations | Gradient:
+    """The normal equations at a trial state, or only the value there where that ends all sessions."""
+    if all(session.is_ending for session in sessions if session.stop is None):
+        value = Gradient(objective, trial, cameras_free)
+        if all(session.ends_with(cost) for session, cost in zip(sessions, value.cost.tolist(), strict=True)):
+            return value
+    return NormalEquations(objective, trial, cameras_free, damping)
+
+
 class _SessionControl:
     """Step acceptance, damping and convergence of one session.
 
@@ -88,6 +102,8 @@ class _SessionControl:
     def __init__(self, termination: Termination, exact_cost: float) -> None:
         self._termination, self._exact_cost = termination, exact_cost
         self._cost, self._predicted, self._damped_share, self._camera_sigmas = math.inf, 0.0, 0.0, math.inf
+        self._shrinkage = 1.0
+        """predicted decrease of the cost over that of the step before"""
         self._trial_damping, self._factor, self._rejected = _INITIAL_DAMPING, _DECREASE, False
         self.damping = _INITIAL_DAMPING
         self.iteration = -1
@@ -96,6 +112,15 @@ class _SessionControl:
         """whether the session has a trial state that differs from its best state"""
         self.at_best = False
         """whether the last system was built at the session's best state"""
+
+    @property
+    def is_ending(self) -> bool:
+        """Whether the session stops at its trial state if the cost falls there as predicted."""
+        return self.stop is None and self.has_trial and self.iteration >= 0 and self._stop_after(self._predicted) is not None
+
+    def ends_with(self, cost: float) -> bool:
+        """Whether the session stops at its trial state if it has this cost, or has stopped already."""
+        return self.stop is not None or self._stop_after(self._cost - cost) is not None
 
     def accept(self, cost: float) -> bool:
         """Take the cost of the last system; True if its state is the new best state."""
@@ -132,6 +157,7 @@ class _SessionControl:
             self.damping = max(self.damping * _DECREASE, _MIN_DAMPING)
         else:
             self.has_trial = True
+            self._shrinkage = predicted / self._predicted if self._predicted else 1.0
             self._predicted, self._damped_share, self._camera_sigmas = predicted, damped_share, camera_sigmas
             self._trial_damping = self.damping
             self.damping = max(self.damping * self._factor, _MIN_DAMPING)
@@ -141,19 +167,30 @@ class _SessionControl:
         agreement = decrease / self._predicted
         self._factor = _DECREASE if agreement > _GOOD_AGREEMENT else _KEEP if agreement > _FAIR_AGREEMENT else _INCREASE
         self._rejected = False
-        if self._damped_share < _MAX_DAMPED_SHARE:
-            if decrease <= self._termination.cost_tolerance * self._cost:
-                self.stop = Stop.COST
-            elif self._camera_sigmas <= self._termination.camera_tolerance:
-                self.stop = Stop.CAMERAS
+        self.stop = self._stop_after(decrease)
 
     def _on_rejected(self) -> None:
         """Go back to the best state with a larger damping, or stop if the step predicted almost nothing."""
         self.at_best = self.has_trial = False
-        if self._predicted <= self._termination.cost_tolerance * self._cost:
-            self.stop = Stop.COST
-        else:
+        self.stop = self._stop_after(-1.0)
+        if self.stop is None:
             self._raise_damping(self._trial_damping)
+
+    def _stop_after(self, decrease: float) -> Stop | None:
+        """Why the session stops if the last step has decreased the cost by so much; None if it goes on.
+
+        The next step is not needed if it would be negligible. By how much steps become shorter is seen from the last two steps,
+        and from how well the prediction of the last one was kept.
+        """
+        limit = self._termination.cost_tolerance * self._cost
+        if not decrease > 0:
+            return Stop.COST if self._predicted <= limit else None
+        if self._damped_share >= _MAX_DAMPED_SHARE:
+            return None
+        shrinkage = max(self._shrinkage, (1 - decrease / self._predicted) ** 2)
+        if decrease <= limit or self._predicted * shrinkage <= _NEGLIGIBLE_SHARE * limit:
+            return Stop.COST
+        return Stop.CAMERAS if self._camera_sigmas * min(1.0, shrinkage**0.5) <= self._termination.camera_tolerance else None
 
     def _raise_damping(self, damping: float) -> None:
         """Set the damping to ten times a value that was too small, or stop if it becomes too large."""

@@ -299,18 +299,23 @@ def _adjoint(minimum: Linearised, mode: GradientMode, gradient: Tangent, objecti
     if not levels.follow:
         return adjoint
     times_hessian, whole, acceleration = gradient, adjoint.dot(gradient).abs(), Acceleration()
+    before = whole
     for _ in range(_MAX_ROUNDS):
         by_levels = levels.by_state(slope_along(objective, minimum.state, adjoint))
         through = tangent_gradient(minimum.state, by_levels, minimum.cameras_free)
         residual = gradient.plus(through, -1.0).plus(times_hessian, -1.0)
         step = mode.solve(minimum, residual)
-        missing = step.dot(residual).abs() > _ACCURACY**2 * whole
+        squared, limit = step.dot(residual).abs(), _ACCURACY**2 * whole
+        missing = squared > limit
         if not bool(missing.any()):
             break
         moved = acceleration.step(step.where(missing).flat(), residual.where(missing).flat())
         adjoint, times_hessian = (
             total.plus(total.like(part)) for total, part in zip((adjoint, times_hessian), moved, strict=True)
         )
+        if bool((~missing | (squared.square() <= 0.01 * limit * before)).all()):  # the next step would be as short
+            break
+        before = squared
     return adjoint
 
 

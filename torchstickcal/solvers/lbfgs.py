@@ -46,7 +46,7 @@ class _PreconditionedState:
 
     def state(self) -> State:
         """The state, differentiable with respect to the preconditioned unknowns."""
-        points = self._start.points + self._point_factor.backward_solve(self.points)
+        points = self._start.points + self._point_factor.backward_solve(self.points.flatten(1))
         if not self.cameras.numel():
             return replace(self._start, points=points)
         step = torch.linalg.solve_triangular(self._camera_factor, self.cameras, upper=True)

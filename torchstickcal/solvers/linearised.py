@@ -9,8 +9,10 @@ from torch import Tensor
 from torch.nn.functional import pad
 
 from torchstickcal.geometry.symmetric import are_definite
+from torchstickcal.lazy import cached_property
 from torchstickcal.model.objective import Objective
 from torchstickcal.model.state import State
+from torchstickcal.solvers.elimination.evaluated import Gradient
 from torchstickcal.solvers.elimination.normal_equations import NormalEquations
 
 _DAMPINGS = (0.0, 1e-10, 1e-7)
@@ -69,6 +71,11 @@ class Linearised:
         self.objective, self.state, self.cameras_free = objective, state, cameras_free
         self._systems: dict[bool, NormalEquations] = {}
 
+    @cached_property
+    def _points_definite(self) -> Tensor:
+        """Whether the exact Hessians of all points are positive definite, (B,)."""
+        return are_definite(self._system(exact=True).point_hessian)
+
     @property
     def gradient(self) -> Tangent:
         """Half the derivative of the objective."""
@@ -81,7 +88,8 @@ class Linearised:
         Where the exact Hessian is not positive definite, Newton's step leads anywhere, and that of Gauss-Newton is taken.
         """
         step = self.solve(gradient)
-        definite = are_definite(self._system(exact=True).point_hessian) & ~((step.dot(gradient) <= 0) & gradient.nonzero)
+        falling = step.dot(gradient) > 0
+        definite = self._points_definite & (falling if bool(falling.all()) else falling | ~gradient.nonzero)
         if bool(definite.all()):
             return step
         return step.where(definite).plus(self.solve(gradient, exact=False).where(~definite))
@@ -139,18 +147,5 @@ def tangent_gradient(state: State, gradient: State, cameras_free: bool) -> Tange
 
 def gradient_at(objective: Objective, state: State, cameras_free: bool) -> Tangent:
     """Half the derivative of an objective at a state, without its Hessian."""
-    m, zeros = objective.measurements, state.points.new_zeros
-    with torch.enable_grad():
-        steps = (zeros(*state.translations.shape[:2], 6), torch.zeros_like(state.points), torch.zeros_like(state.unknowns))
-        cameras, points, unknowns = (step.requires_grad_() for step in steps)
-        found = _derivatives(objective.slope_of_scene(state, points, unknowns), cameras, points, unknowns)
-        for columns in m.chunks():
-            slope = objective.slope_of_images(state, cameras, points, unknowns, columns)
-            found = [sum_ + part for sum_, part in zip(found, _derivatives(slope, cameras, points, unknowns), strict=True)]
-    by_cameras, by_points, by_unknowns = found
-    free = slice(1, None) if cameras_free else slice(0, 0)
-    return Tangent(by_cameras[:, free], by_unknowns if cameras_free else by_unknowns[:, :0], by_points)
-
-
-def _derivatives(slope: Tensor, *steps: Tensor) -> list[Tensor]:
-    return list(torch.autograd.grad(slope, steps, allow_unused=True, materialize_grads=True))
+    found = Gradient(objective, state, cameras_free, torch.float64)
+    return Tangent(found.camera_gradient, found.unknown_gradient, found.point_gradient)

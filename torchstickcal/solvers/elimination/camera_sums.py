@@ -41,14 +41,29 @@ class CameraSums:
 
     def add(self, points: Tensor, gradient: Tensor, hessian: Tensor, unknown: UnknownTerms | None) -> None:
         """Add the points (B, 3, n) of a chunk: gradients (B, C, 3, n), Hessians (B, C, 6, n), terms of the unknowns."""
-        homogeneous = torch.cat([torch.ones_like(points[:, :1]), points], dim=1)
+        homogeneous = self.add_gradient(points, gradient, None if unknown is None else unknown.gradient)
         products = homogeneous[:, _PRODUCTS[0]] * homogeneous[:, _PRODUCTS[1]]
-        self._gradient_moments += gradient[:, 1:].flatten(1, 2) @ homogeneous.mT
         self._hessian_moments += hessian[:, 1:].flatten(1, 2) @ products.mT
         if unknown is not None:
-            self.unknown_gradient += unknown.gradient
             self.unknown_hessian += unknown.hessian
             self._unknown_moments += unknown.coupling[:, 1:] @ homogeneous.mT[:, None, None]
+
+    def add_gradient(self, points: Tensor, gradient: Tensor, unknown_gradient: Tensor | None) -> Tensor:
+        """Add only what the gradients need: also those of the unknowns, (B, C, k). Returns h, (B, 4, n)."""
+        homogeneous = torch.cat([torch.ones_like(points[:, :1]), points], dim=1)
+        self._gradient_moments += gradient[:, 1:].flatten(1, 2) @ homogeneous.mT
+        if unknown_gradient is not None:
+            self.unknown_gradient += unknown_gradient
+        return homogeneous
+
+    def include(self, other: CameraSums) -> None:
+        """Add the sums over other points."""
+        self._gradient_moments += other._gradient_moments
+        self._hessian_moments += other._hessian_moments
+        if self.unknown_gradient.numel():
+            self._unknown_moments += other._unknown_moments
+            self.unknown_gradient += other.unknown_gradient
+            self.unknown_hessian += other.unknown_hessian
 
     def pose_gradient(self) -> Tensor:
         """Gradient with respect to the tangents, (B, C', 6)."""

@@ -20,9 +20,9 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import reduce
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import torch
 from torch import Tensor
@@ -30,18 +30,23 @@ from torch import Tensor
 from torchstickcal.geometry import se3
 from torchstickcal.geometry.symmetric import DIAGONAL, IDENTITY, inverse_diagonal, raised
 from torchstickcal.losses.camera_point import CameraPointTerms, UnknownTerms
-from torchstickcal.model.objective import PRIOR, Objective
+from torchstickcal.model.objective import Objective
 from torchstickcal.model.state import State
-from torchstickcal.model.unknowns import Columns, RigUnknowns
-from torchstickcal.solvers.base import IterationRecord
+from torchstickcal.model.unknowns import Columns
 from torchstickcal.solvers.elimination.camera_sums import CameraSums
-from torchstickcal.solvers.elimination.cross_blocks import cross_rows, symmetric_times
+from torchstickcal.solvers.elimination.cross_blocks import symmetric_times
+from torchstickcal.solvers.elimination.evaluated import Evaluated
 from torchstickcal.solvers.elimination.parts import BetweenFrames, Couplings, Part, WithinFrame, parts
 from torchstickcal.solvers.elimination.points import PointElimination
 from torchstickcal.solvers.elimination.tracks import TrackElimination
+from torchstickcal.workers import map_with_idle_workers
+
+_Result = TypeVar("_Result")
 
 _MAX_CACHED_BYTES = 2**28
 """Memory up to which the blocks N_c are cached for the back-substitution."""
+_MAX_SOLVED_BYTES = 2**24
+"""Memory up to which the rows W^T are cached in their place. They save work, as long as they fit into the processor's cache."""
 
 
 class Step(NamedTuple):
@@ -79,13 +84,24 @@ class _EliminatedPart(NamedTuple):
 
     coupling: _CameraCoupling
     elimination: PointElimination | TrackElimination
+    rows: Tensor | None = None
+    """``W^T = (L^-1 H_xc)^T``, where it is kept"""
 
-    def forward_solve_cross(self, points: Tensor, gradient: Tensor) -> tuple[Tensor, Tensor]:
-        """``(L^-1 H_xc)^T`` and ``L^-1 g``, for points and a gradient (B, 3, n)."""
-        camera_blocks, camera_gradients, unknown_blocks = self.coupling
-        return self.elimination.forward_solve_cross(camera_blocks, points, gradient, camera_gradients, unknown_blocks)
+    def solved_rows(self, points: Tensor) -> Tensor:
+        """``W^T = (L^-1 H_xc)^T`` (B, 6 C' + K, 3 n), for points (B, 3, n)."""
+        return self.elimination.forward_solve_cross(*self.coupling, points) if self.rows is None else self.rows
 
-    def cross_product(self, points: Tensor, camera_step: Tensor, unknown_step: Tensor) -> Tensor:
+    def back_substituted(self, rhs: Tensor, points: Tensor, camera_step: Tensor, unknown_step: Tensor) -> Tensor:
+        """``H_xx^-1 (b - H_xc s)`` (B, 3, n), for a right-hand side b (B, 3, n) and a step s of cameras and unknowns."""
+        if not self.coupling.camera_blocks.shape[1]:
+            return self.elimination.solve(rhs)
+        if self.rows is None:
+            return self.elimination.solve(rhs - self._cross_product(points, camera_step, unknown_step))
+        step = torch.cat([camera_step.flatten(1), unknown_step], dim=1).to(rhs.dtype)
+        forward = self.elimination.forward_solve(rhs)
+        return self.elimination.backward_solve(torch.baddbmm(forward[:, None], step[:, None], self.rows, alpha=-1)[:, 0])
+
+    def _cross_product(self, points: Tensor, camera_step: Tensor, unknown_step: Tensor) -> Tensor:
         """``H_xc`` times a step of the cameras, (B, C', 6), and of the lens and clock unknowns, (B, K): (B, 3, n)."""
         camera_blocks, camera_gradients, unknown_blocks = self.coupling
         rotation = se3.hat(camera_step[..., 3:])
@@ -98,7 +114,21 @@ class _EliminatedPart(NamedTuple):
         return product
 
 
-class NormalEquations:
+class _PartTerms(NamedTuple):
+    """What a part adds to the system of the cameras."""
+
+    images: list[tuple[str, CameraPointTerms]]
+    """the camera-point losses, without what there is one of per column"""
+    sums: CameraSums
+    rows_squared: Tensor
+    """W^T W"""
+    rows_gradient: Tensor
+    """``W^T L^-1 g``"""
+    eliminated: _EliminatedPart | None
+    """the part, where it is kept"""
+
+
+class NormalEquations(Evaluated):
     """The Gauss-Newton system of B sessions at a state.
 
     C' is the number of free cameras: all but the first, or none. K is the number of lens and clock unknowns, 0 if the cameras
@@ -114,18 +144,8 @@ class NormalEquations:
             definite except at a minimum.
     """
 
-    terms: dict[str, Tensor]
-    """value of each loss, (B,)"""
-    reprojection_px: Tensor
-    """(B, C), weighted root mean square reprojection error"""
     point_hessian: Tensor
     """(B, 6, N), diagonal blocks of H_xx, without damping"""
-    point_gradient: Tensor
-    """(B, 3, N)"""
-    camera_gradient: Tensor
-    """(B, C', 6)"""
-    unknown_gradient: Tensor
-    """(B, K)"""
     reduced: Tensor
     """(B, 6 C' + K, 6 C' + K), the reduced camera system S"""
     reduced_gradient: Tensor
@@ -139,21 +159,12 @@ class NormalEquations:
         damping: float | Tensor = 0.0,
         exact: bool = False,
     ) -> None:
-        m = objective.measurements
-        self._exact = exact
-        self.objective, self.state = objective, state
-        self._free_cameras = m.num_cameras - 1 if cameras_free else 0
-        self._unknowns = m.unknowns if cameras_free else RigUnknowns.of((), m.cameras)
+        super().__init__(objective, state, cameras_free)
+        m, self._exact = objective.measurements, exact
         self._damping = torch.as_tensor(damping, dtype=torch.float64, device=state.points.device).expand(m.sessions)
-        self.terms = {name: state.points.new_zeros(m.sessions) for name in objective.losses}
         self._parts = parts(m, objective.clusters, self._add_point_losses())
-        self._cache: list[_EliminatedPart] | None = None
+        self._cache: dict[int, _EliminatedPart] = {}
         self._add_camera_point_losses()
-
-    @property
-    def cost(self) -> Tensor:
-        """The objective's value, (B,)."""
-        return torch.stack(list(self.terms.values())).sum(0)
 
     def step(self) -> Step:
         """The Levenberg-Marquardt step."""
@@ -165,13 +176,17 @@ class NormalEquations:
         rig_gradient = torch.cat([self.camera_gradient.flatten(1), self.unknown_gradient], dim=1)
         descent = -(rig_gradient * rig_step).sum(1)
         squared = (self._rig_diagonal * rig_step.square()).sum(1)
-        for part, eliminated in self._eliminated_parts():
-            rhs = gradient[..., part.columns]
-            cross = eliminated.cross_product(self.state.points[..., part.columns], camera_step, unknown_step)
-            solved = eliminated.elimination.solve(rhs + cross).neg_()
+
+        def step_of(part: Part, eliminated: _EliminatedPart) -> tuple[Tensor, Tensor]:
+            rhs = -gradient[..., part.columns]
+            solved = eliminated.back_substituted(rhs, self.state.points[..., part.columns], camera_step, unknown_step)
             point_step[..., part.columns] = solved
-            descent -= (rhs * solved).sum((1, 2), dtype=torch.float64)
-            squared += (hessian[..., part.columns][:, DIAGONAL] * solved.square()).sum((1, 2), dtype=torch.float64)
+            weighted = hessian[..., part.columns][:, DIAGONAL] * solved.square()
+            return (rhs * solved).sum((1, 2), dtype=torch.float64), weighted.sum((1, 2), dtype=torch.float64)
+
+        for own_descent, own_squared in self._of_parts(step_of):
+            descent += own_descent
+            squared += own_squared
         damped = squared * self._damping
         squared_sigmas = -(self.reduced_gradient * rig_step).sum(1)
         return Step(
@@ -197,16 +212,23 @@ class NormalEquations:
         """
         point_rhs = point_rhs.to(self.point_hessian.dtype)
         reduced_rhs = torch.cat([camera_rhs.flatten(1), unknown_rhs], dim=1)
-        for part, eliminated in self._eliminated_parts() if self._free_cameras else ():
-            rows, solved = eliminated.forward_solve_cross(self._points(part.columns), point_rhs[..., part.columns])
-            reduced_rhs = reduced_rhs - (rows @ solved[..., None])[..., 0]
+
+        def reduced_share(part: Part, eliminated: _EliminatedPart) -> Tensor:
+            solved = eliminated.elimination.forward_solve(point_rhs[..., part.columns])
+            return (eliminated.solved_rows(self._points(part.columns)) @ solved[..., None])[..., 0]
+
+        for share in self._of_parts(reduced_share) if self._free_cameras else ():
+            reduced_rhs = reduced_rhs - share
         factor, failed = torch.linalg.cholesky_ex(self.reduced)
         rig = torch.cholesky_solve(reduced_rhs[..., None], factor)[..., 0]
         cameras, unknowns = self._split(rig)
         points = torch.empty_like(point_rhs)
-        for part, eliminated in self._eliminated_parts():
-            cross = eliminated.cross_product(self.state.points[..., part.columns], cameras, unknowns)
-            points[..., part.columns] = eliminated.elimination.solve(point_rhs[..., part.columns] - cross)
+
+        def back_substitute(part: Part, eliminated: _EliminatedPart) -> None:
+            own = point_rhs[..., part.columns], self.state.points[..., part.columns]
+            points[..., part.columns] = eliminated.back_substituted(*own, cameras, unknowns)
+
+        self._of_parts(back_substitute)
         finite = rig.isfinite().all(1) & points.flatten(1).isfinite().all(1)
         return cameras, unknowns, points, (failed == 0) & finite
 
@@ -224,36 +246,14 @@ class NormalEquations:
         """``-H_xx^-1 H_xc``: movement of the points per unit step of the cameras, (B, 6 C' + K, 3, N)."""
         points = self.state.points
         response = points.new_empty(len(points), self.reduced.shape[1], *points.shape[1:])
-        for part in self._parts:
-            (camera_blocks, _, unknown_blocks), elimination = self._eliminate(part)
-            rows = cross_rows(camera_blocks, self._points(part.columns)).flatten(1, 2)
-            if unknown_blocks is not None:
-                rows = torch.cat([rows, unknown_blocks], dim=1)
-            for row in range(rows.shape[1]):
-                response[:, row][..., part.columns] = -elimination.solve(rows[:, row]).to(response)
-        return response
 
-    def records(self, stage: str, iterations: list[int], dampings: list[float], steps_m: list[float]) -> list[IterationRecord]:
-        """The record of each session for an iteration that ends at this state."""
-        m = self.objective.measurements
-        terms = {name: value.tolist() for name, value in self.terms.items()}
-        lengths = m.stick_lengths_m(self.state.points).flatten(1).nanmean(1).tolist()
-        return [
-            IterationRecord(
-                session=session,
-                stage=stage,
-                iteration=iterations[session],
-                cost=sum(values[session] for values in terms.values()),
-                terms={name: values[session] for name, values in terms.items()},
-                damping=dampings[session],
-                step_m=steps_m[session],
-                reprojection_px=tuple(pixels),
-                stick_length_m=lengths[session],
-                rotations=self.state.rotations[session],
-                translations=self.state.translations[session],
-            )
-            for session, pixels in enumerate(self.reprojection_px.tolist())
-        ]
+        def respond(part: Part, eliminated: _EliminatedPart) -> None:
+            rows = eliminated.solved_rows(self._points(part.columns))
+            for row in range(rows.shape[1]):
+                response[:, row][..., part.columns] = -eliminated.elimination.backward_solve(rows[:, row]).to(response)
+
+        self._of_parts(respond)
+        return response
 
     def _add_point_losses(self) -> Couplings:
         """Add the losses without cameras to the points' gradient and Hessian. Returns the blocks off the diagonal."""
@@ -268,12 +268,11 @@ class NormalEquations:
     def _add_frame_losses(self) -> WithinFrame:
         """Add the frame losses. Returns the blocks between different points of a frame."""
         m, within = self.objective.measurements, WithinFrame()
-        hessian, gradient = m.by_frame(self.point_hessian), m.by_frame(self.point_gradient)
+        hessian = m.by_frame(self.point_hessian)
         for name, terms in self.objective.linearise_frames(self.state, self._exact).items():
-            self.terms[name] = self.terms[name] + terms.cost
+            self._add_frame_gradient(name, terms)
             members = self.objective.groups[name].unbind(1)
             for number, points in enumerate(members):
-                gradient.index_add_(-1, points, terms.gradient[:, number].to(gradient.dtype))
                 hessian.index_add_(-1, points, terms.hessian[:, number].to(hessian.dtype))
             for (first, second), blocks in zip(itertools.combinations(members, 2), terms.cross.unbind(1), strict=True):
                 within.add(first, second, blocks.to(hessian.dtype))
@@ -284,14 +283,13 @@ class NormalEquations:
         m = self.objective.measurements
         if not self.objective.track_losses:
             return None
-        hessian, gradient = m.by_frame(self.point_hessian), m.by_frame(self.point_gradient)
+        hessian = m.by_frame(self.point_hessian)
         between = [hessian.new_zeros(m.sessions, max(0, m.frames - step), m.points_per_frame) for step in (1, 2)]
         for name, terms in self.objective.linearise_tracks(self.state).items():
-            self.terms[name] = self.terms[name] + terms.cost
+            self._add_track_gradient(name, terms)
             stencil, frames = self.objective.track_losses[name].stencil, terms.scale.shape[1]
-            information, slope = terms.scale.square().to(hessian.dtype), terms.scale[:, None] * terms.residual
+            information = terms.scale.square().to(hessian.dtype)
             for i, factor in enumerate(stencil):
-                gradient[:, :, i : i + frames] += factor * slope
                 for axis in DIAGONAL:
                     hessian[:, axis, i : i + frames] += factor**2 * information
                 for j, other in enumerate(stencil[i + 1 :], i + 1):
@@ -300,67 +298,66 @@ class NormalEquations:
 
     def _add_camera_point_losses(self) -> None:
         """Linearise the camera-point losses of every part and, if the cameras are free, build the reduced camera system."""
-        m, free, zeros = self.objective.measurements, self._free_cameras, self.state.points.new_zeros
-        size = 6 * free + self._unknowns.count
-        squares, weights = zeros(m.sessions, m.num_cameras), zeros(m.sessions, m.num_cameras)
-        reduced, reduced_gradient = zeros(m.sessions, size, size), zeros(m.sessions, size)
-        sums = CameraSums(self.state.points, m.num_cameras, free, self._unknowns.components)
-        if (2 * free + self._unknowns.count) * m.sessions * m.num_columns * 3 * m.pixels.element_size() <= _MAX_CACHED_BYTES:
-            self._cache = []
-        for part in self._parts:
-            chunks: list[_CameraCoupling] = []
-            for columns in part.chunks:
-                terms = self._linearise(columns)
-                for name, term in terms.items():
-                    self.terms[name] = self.terms[name] + term.cost
-                    squares += term.squares
-                    weights += term.weights
-                gradient, hessian, unknown = _sum_over_losses(terms)
-                self.point_gradient[..., columns] += gradient.sum(1)
-                self.point_hessian[..., columns] += hessian.sum(1)
-                if free:
-                    sums.add(self._points(columns), gradient, hessian, unknown)
-                    chunks.append(self._camera_coupling(gradient, hessian, unknown))
-            if free:
-                eliminated = self._eliminate(part, chunks)
-                rows, solved = eliminated.forward_solve_cross(
-                    self._points(part.columns), self.point_gradient[..., part.columns]
-                )
-                reduced -= rows @ rows.mT
-                reduced_gradient -= (rows @ solved[..., None])[..., 0]
-                if self._cache is not None:
-                    self._cache.append(eliminated)
+        m, zeros = self.objective.measurements, self.state.points.new_zeros
+        size = 6 * self._free_cameras + self._unknowns.count
+        reduced, reduced_gradient, sums = zeros(m.sessions, size, size), zeros(m.sessions, size), self._new_sums()
+        bytes_per_row = 3 * m.sessions * m.num_columns * m.pixels.element_size()
+        keeps_rows = size * bytes_per_row <= _MAX_SOLVED_BYTES
+        keeps = keeps_rows or (2 * self._free_cameras + self._unknowns.count) * bytes_per_row <= _MAX_CACHED_BYTES
+        found = map_with_idle_workers(lambda part: self._part_terms(part, keeps, keeps_rows), self._parts)
+        for index, terms in enumerate(found):
+            for name, term in terms.images:
+                self._add_images(name, term)
+            if self._free_cameras:
+                sums.include(terms.sums)
+                reduced -= terms.rows_squared
+                reduced_gradient -= terms.rows_gradient
+            if terms.eliminated is not None:
+                self._cache[index] = terms.eliminated
+        self._sum_up_images(sums)
         rig_hessian = self._rig_hessian(sums)
         self._rig_diagonal = rig_hessian.diagonal(dim1=1, dim2=2).clone()
         rig_hessian.diagonal(dim1=1, dim2=2).mul_(1 + self._damping[:, None])
         self.reduced = reduced.add_(rig_hessian)
         self.reduced_gradient = reduced_gradient + torch.cat([self.camera_gradient.flatten(1), self.unknown_gradient], dim=1)
-        self.reprojection_px = (squares / weights.clamp_min(1e-300)).sqrt()
+
+    def _part_terms(self, part: Part, keeps: bool, keeps_rows: bool) -> _PartTerms:
+        """Linearise a part's camera-point losses, add them to the points' blocks, and eliminate it if the cameras are free."""
+        images: list[tuple[str, CameraPointTerms]] = []
+        chunks: list[_CameraCoupling] = []
+        sums, empty = self._new_sums(), self.state.points[:, :0, 0]
+        for columns in part.chunks:
+            terms = self._linearise(columns)
+            images += [(name, term._replace(gradient=empty, hessian=empty, unknown=None)) for name, term in terms.items()]
+            gradient, hessian, unknown = _sum_over_losses(terms)
+            self.point_gradient[..., columns] += gradient.sum(1)
+            self.point_hessian[..., columns] += hessian.sum(1)
+            if self._free_cameras:
+                sums.add(self._points(columns), gradient, hessian, unknown)
+                chunks.append(self._camera_coupling(gradient, hessian, unknown))
+        if not self._free_cameras:
+            return _PartTerms(images, sums, empty, empty, None)
+        eliminated = self._eliminate(part, chunks)
+        rows = eliminated.solved_rows(self._points(part.columns))
+        solved = eliminated.elimination.forward_solve(self.point_gradient[..., part.columns])
+        kept = eliminated._replace(rows=rows) if keeps_rows else eliminated
+        return _PartTerms(images, sums, rows @ rows.mT, (rows @ solved[..., None])[..., 0], kept if keeps else None)
 
     def _rig_hessian(self, sums: CameraSums) -> Tensor:
-        """H_cc with the lens and clock unknowns, (B, 6 C' + K, 6 C' + K). Sets the gradients and adds the prior."""
+        """H_cc with the lens and clock unknowns and their prior, (B, 6 C' + K, 6 C' + K)."""
         free, unknowns = self._free_cameras, self._unknowns
         tangents, size = 6 * free, 6 * free + unknowns.count
         hessian = self.state.points.new_zeros(len(self.state.points), size, size)
         poses = hessian[:, :tangents, :tangents].view(len(hessian), free, 6, free, 6)
         poses.diagonal(dim1=1, dim2=3).copy_(sums.pose_hessian(self._exact).permute(0, 2, 3, 1))
-        self.camera_gradient = sums.pose_gradient()
-        self.unknown_gradient = hessian.new_zeros(len(hessian), unknowns.count)
         if unknowns.count:
             share = unknowns.share
             with_poses = torch.einsum("ckj,bckt->bctj", share[1:], sums.unknown_pose_hessian()).flatten(1, 2)
             hessian[:, :tangents, tangents:] = with_poses
             hessian[:, tangents:, :tangents] = with_poses.mT
             hessian[:, tangents:, tangents:] = torch.einsum("cki,bckl,clj->bij", share, sums.unknown_hessian, share)
-            self.unknown_gradient = torch.einsum("ckj,bck->bj", share, sums.unknown_gradient)
-            self._add_prior(hessian[:, tangents:, tangents:])
+            hessian[:, tangents:, tangents:].diagonal(dim1=1, dim2=2).add_(self._prior_information)
         return hessian
-
-    def _add_prior(self, hessian: Tensor) -> None:
-        """Add the prior of the lens and clock unknowns to the terms, to their gradient, and to their block (B, K, K)."""
-        self.terms[PRIOR], gradient, information = self.objective.linearise_prior(self.state)
-        self.unknown_gradient += gradient
-        hessian.diagonal(dim1=1, dim2=2).add_(information)
 
     def _linearise(self, columns: Columns) -> dict[str, CameraPointTerms]:
         return self.objective.linearise_chunk(self.state, columns, self._exact, self._unknowns.count > 0)
@@ -370,12 +367,18 @@ class NormalEquations:
         tangents = 6 * self._free_cameras
         return rig[:, :tangents].unflatten(1, (self._free_cameras, 6)), rig[:, tangents:]
 
-    def _eliminated_parts(self) -> Iterator[tuple[Part, _EliminatedPart]]:
-        """All parts, eliminated: from the cache, or computed again."""
-        if not self._cache and not self._free_cameras:
-            self._cache = [self._eliminate(part) for part in self._parts]
-        for index, part in enumerate(self._parts):
-            yield part, self._cache[index] if self._cache else self._eliminate(part)
+    def _of_parts(self, function: Callable[[Part, _EliminatedPart], _Result]) -> list[_Result]:
+        """The results of a function of every part, eliminated: from the cache, or computed again."""
+
+        def of_part(index: int) -> _Result:
+            part, eliminated = self._parts[index], self._cache.get(index)
+            if eliminated is None:
+                eliminated = self._eliminate(part)
+                if not self._free_cameras:
+                    self._cache[index] = eliminated
+            return function(part, eliminated)
+
+        return map_with_idle_workers(of_part, range(len(self._parts)))
 
     def _eliminate(self, part: Part, chunks: list[_CameraCoupling] | None = None) -> _EliminatedPart:
         """Factor a part. ``chunks`` are the couplings of its chunks; None to compute them."""

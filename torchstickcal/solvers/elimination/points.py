@@ -40,14 +40,15 @@ class PointElimination:
         """-L_D^-1 C^T L_A^-T, stored as (B, column, row, m)"""
 
     def forward_solve(self, rhs: Tensor) -> Tensor:
-        """``L^-1 b`` for right-hand sides b, (B, 3, n)."""
+        """``L^-1 b`` (B, 3 n) for right-hand sides b, (B, 3, n)."""
         solved = forward(self._lower, rhs)
         if self._has_pairs:
             solved[..., self._second] += (self._first_to_second * solved[..., self._first].unsqueeze(-2)).sum(-3)
-        return solved
+        return solved.flatten(1)
 
-    def backward_solve(self, rhs: Tensor) -> Tensor:
-        """``L^-T b`` for right-hand sides b, (B, 3, n). Differentiable with respect to b."""
+    def backward_solve(self, solved: Tensor) -> Tensor:
+        """``L^-T y`` (B, 3, n) for y as :meth:`forward_solve` returns it, (B, 3 n). Differentiable with respect to y."""
+        rhs = solved.unflatten(1, (3, -1))
         if self._has_pairs:
             second = backward(self._lower[..., self._second], rhs[..., self._second])
             rhs = rhs.index_add(-1, self._first, (self._pair_factor * second.unsqueeze(-2)).sum(-3))
@@ -60,21 +61,19 @@ class PointElimination:
     def forward_solve_cross(
         self,
         camera_blocks: Tensor,
+        camera_gradients: Tensor | None,
+        unknown_blocks: Tensor | None,
         points: Tensor,
-        gradient: Tensor,
-        camera_gradients: Tensor | None = None,
-        unknown_blocks: Tensor | None = None,
-    ) -> tuple[Tensor, Tensor]:
-        """``(L^-1 H_xc)^T`` (B, 6 C' + K, 3 n), with the K lens and clock unknowns last, and ``L^-1 g`` (B, 3 n).
+    ) -> Tensor:
+        """``(L^-1 H_xc)^T`` (B, 6 C' + K, 3 n), with the K lens and clock unknowns last.
 
         Args:
             camera_blocks: N_c of C' cameras, (B, C', 6, n).
-            points: X, (B, 3, n).
-            gradient: g, (B, 3, n).
             camera_gradients: the gradient of each camera's part of the cost, (B, C', 3, n), for the exact Hessian; None for the
                 Gauss-Newton Hessian.
             unknown_blocks: H_xk, the blocks between the points and the lens and clock unknowns, (B, K, 3, n); None without such
                 unknowns.
+            points: X, (B, 3, n).
         """
         unknowns = 0 if unknown_blocks is None else unknown_blocks.shape[1]
         tangents = 6 * camera_blocks.shape[1]
@@ -87,7 +86,7 @@ class PointElimination:
             rows[:, tangents:] = forward(self._lower[:, None], unknown_blocks)
         if self._has_pairs:
             rows[..., self._second] += (self._first_to_second[:, None] * rows[..., self._first].unsqueeze(-2)).sum(-3)
-        return rows.flatten(2), self.forward_solve(gradient).flatten(1)
+        return rows.flatten(2)
 
 
 def _fill_camera_rows(rows: Tensor, lower: Tensor, blocks: Tensor, points: Tensor) -> None:

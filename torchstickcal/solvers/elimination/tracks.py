@@ -1,9 +1,9 @@
 """Elimination of tracks: points that losses couple over time. It is exact, and its cost is linear in the number of frames.
 
-A second difference couples three consecutive frames. With two frames per block the Hessian of a track is therefore block
-tridiagonal. It is factored by cyclic reduction: all odd blocks of all tracks are eliminated at once. A block tridiagonal matrix
-with half as many blocks remains, and is reduced in the same way. Points that losses couple within a frame, such as the ends of
-a stick, form one track.
+A second difference couples three consecutive frames. With two or more frames per block the Hessian of a track is therefore
+block tridiagonal. It is factored by cyclic reduction: all odd blocks of all tracks are eliminated at once. A block tridiagonal
+matrix with half as many blocks remains, and is reduced in the same way. Points that losses couple within a frame, such as the
+ends of a stick, form one track.
 """
 
 from __future__ import annotations
@@ -15,6 +15,9 @@ from torch import Tensor
 
 from torchstickcal.geometry.symmetric import expand
 from torchstickcal.solvers.elimination.cross_blocks import cross_rows, rotation_curvature_rows
+
+_ROWS_PER_BLOCK = 12
+"""About as many rows as a block should have: small matrices take a multiple of their arithmetic, large ones have more of it."""
 
 
 class _Level(NamedTuple):
@@ -38,6 +41,8 @@ class BlockTridiagonal:
 
     def __init__(self, diagonal: Tensor, below: Tensor) -> None:
         self._levels: list[_Level] = []
+        self.counts: list[int] = []
+        """the number of blocks eliminated at each level"""
         while diagonal.shape[-3] > 1:
             inverse = _inverse_factor(diagonal[..., 1::2, :, :])
             to_right = below[..., 1::2, :, :].mT
@@ -48,6 +53,8 @@ class BlockTridiagonal:
             diagonal[..., 1 : 1 + right.shape[-3], :, :] -= right.mT @ right
             below = -right.mT @ left[..., : right.shape[-3], :, :]
             self._levels.append(_Level(inverse, left, right))
+            self.counts.append(inverse.shape[-3])
+        self.counts.append(1)
         self._last = _inverse_factor(diagonal)
 
     def forward_solve(self, rhs: Tensor) -> list[Tensor]:
@@ -106,17 +113,38 @@ class TrackElimination:
             between = empty, empty
         self._shape = tracks, frames, hessian.shape[-1]
         by_track = diagonal.reshape(sessions * tracks, frames, *diagonal.shape[-2:])
-        couplings = (factors.transpose(1, 2).flatten(0, 1).repeat_interleave(3, -1) for factors in between)
-        self._factor = BlockTridiagonal(*_two_frames_per_block(by_track, *couplings))
+        next_frame, second_frame = (factors.transpose(1, 2).flatten(0, 1).repeat_interleave(3, -1) for factors in between)
+        self._size = max(2, min(_ROWS_PER_BLOCK // (3 * hessian.shape[-1]), frames))
+        """frames per block"""
+        self._factor = BlockTridiagonal(*_block_tridiagonal(by_track, next_frame, second_frame, self._size))
+
+    def forward_solve(self, rhs: Tensor) -> Tensor:
+        """``L^-1 b`` for right-hand sides b, (B, 3, n): (B, 3 n'), in the order of elimination, with n' >= n."""
+        return self._forward_solve(rhs[:, None])[:, 0]
+
+    def backward_solve(self, solved: Tensor) -> Tensor:
+        """``L^-T y`` (B, 3, n) for y as :meth:`forward_solve` returns it."""
+        tracks, frames, points = self._shape
+        rows = self._size * 3 * points
+        sizes = [tracks * count * rows for count in self._factor.counts]
+        levels = [
+            level.reshape(len(solved) * tracks, count, rows, 1)
+            for level, count in zip(solved.split(sizes, dim=1), self._factor.counts, strict=True)
+        ]
+        by_frame = self._factor.backward_solve(levels).reshape(len(solved), tracks, -1, points, 3)[:, :, :frames]
+        return by_frame.permute(0, 4, 1, 2, 3).flatten(2)
+
+    def solve(self, rhs: Tensor) -> Tensor:
+        """``H^-1 b`` for right-hand sides b, (B, 3, n)."""
+        return self.backward_solve(self.forward_solve(rhs))
 
     def forward_solve_cross(
         self,
         camera_blocks: Tensor,
+        camera_gradients: Tensor | None,
+        unknown_blocks: Tensor | None,
         points: Tensor,
-        gradient: Tensor,
-        camera_gradients: Tensor | None = None,
-        unknown_blocks: Tensor | None = None,
-    ) -> tuple[Tensor, Tensor]:
+    ) -> Tensor:
         """As :meth:`PointElimination.forward_solve_cross`, but with the columns in the order of elimination."""
         rows = cross_rows(camera_blocks, points)
         if camera_gradients is not None:
@@ -124,24 +152,20 @@ class TrackElimination:
         rows = rows.flatten(1, 2)
         if unknown_blocks is not None:
             rows = torch.cat([rows, unknown_blocks], dim=1)
-        levels = self._factor.forward_solve(self._blocks(torch.cat([rows, gradient[:, None]], dim=1)))
-        solved = torch.cat([level.unflatten(0, (len(rows), -1)).flatten(1, -2) for level in levels], dim=1).mT
-        return solved[:, :-1], solved[:, -1]
+        return self._forward_solve(rows)
 
-    def solve(self, rhs: Tensor) -> Tensor:
-        """``H^-1 b`` for right-hand sides b, (B, 3, n)."""
-        tracks, frames, points = self._shape
-        solved = self._factor.backward_solve(self._factor.forward_solve(self._blocks(rhs[:, None])))
-        by_frame = solved.reshape(len(rhs), tracks, -1, points, 3)[:, :, :frames]
-        return by_frame.permute(0, 4, 1, 2, 3).flatten(2)
+    def _forward_solve(self, rows: Tensor) -> Tensor:
+        """``L^-1 b`` for k right-hand sides (B, k, 3, n), (B, k, 3 n')."""
+        levels = self._factor.forward_solve(self._blocks(rows))
+        return torch.cat([level.unflatten(0, (len(rows), -1)).flatten(1, -2) for level in levels], dim=1).mT
 
     def _blocks(self, rhs: Tensor) -> Tensor:
-        """Right-hand sides (B, k, 3, n) as blocks of two frames, (B T, G, 6 q, k)."""
+        """Right-hand sides (B, k, 3, n) as blocks of frames, (B T, G, size 3 q, k)."""
         tracks, frames, points = self._shape
         by_frame = rhs.unflatten(-1, self._shape).permute(0, 3, 4, 5, 2, 1)
         by_frame = by_frame.reshape(len(rhs) * tracks, frames, 3 * points, rhs.shape[1])
-        padded = torch.nn.functional.pad(by_frame, (0, 0, 0, 0, 0, frames % 2))
-        return padded.unflatten(1, (-1, 2)).flatten(2, 3)
+        padded = torch.nn.functional.pad(by_frame, (0, 0, 0, 0, 0, -frames % self._size))
+        return padded.unflatten(1, (-1, self._size)).flatten(2, 3)
 
 
 def _block_diagonal(entries: Tensor) -> Tensor:
@@ -151,22 +175,33 @@ def _block_diagonal(entries: Tensor) -> Tensor:
     return torch.einsum("bijtfq,qr->btfqirj", blocks, same_point).flatten(-2).flatten(-3, -2)
 
 
-def _two_frames_per_block(diagonal: Tensor, next_frame: Tensor, second_frame: Tensor) -> tuple[Tensor, Tensor]:
-    """Block tridiagonal form of T tracks with diagonal blocks (T, F, m, m) and couplings (T, F - 1, m) and (T, F - 2, m).
+def _block_tridiagonal(diagonal: Tensor, next_frame: Tensor, second_frame: Tensor, size: int) -> tuple[Tensor, Tensor]:
+    """Block tridiagonal form, with ``size`` frames in each of G blocks, of T tracks: diagonal (T, G, size m, size m) and below.
 
-    An odd number of frames is padded with an identity block.
+    Args:
+        diagonal: blocks of the frames, (T, F, m, m); missing frames of the last block are filled up with identities.
+        next_frame: couplings between frames f and f + 1, factors of the identity, (T, F - 1, m).
+        second_frame: the same between frames f and f + 2, (T, F - 2, m).
+        size: 2 or more.
     """
     tracks, frames, m, _ = diagonal.shape
-    if frames % 2:
-        padding = torch.eye(m, dtype=diagonal.dtype, device=diagonal.device).expand(tracks, 1, m, m)
+    missing = -frames % size
+    if missing:
+        padding = torch.eye(m, dtype=diagonal.dtype, device=diagonal.device).expand(tracks, missing, m, m)
         diagonal = torch.cat([diagonal, padding], dim=1)
-    padded = diagonal.shape[1]
-    next_frame = torch.nn.functional.pad(next_frame, (0, 0, 0, padded - 1 - next_frame.shape[1])).diag_embed()
-    second_frame = torch.nn.functional.pad(second_frame, (0, 0, 0, padded - 2 - second_frame.shape[1])).diag_embed()
-    blocks = diagonal.new_zeros(tracks, padded // 2, 2 * m, 2 * m)
-    blocks[..., :m, :m], blocks[..., m:, m:] = diagonal[:, 0::2], diagonal[:, 1::2]
-    blocks[..., :m, m:] = blocks[..., m:, :m] = next_frame[:, 0::2]
-    below = diagonal.new_zeros(tracks, padded // 2 - 1, 2 * m, 2 * m)
-    below[..., :m, :m], below[..., m:, m:] = second_frame[:, 0::2], second_frame[:, 1::2]
-    below[..., :m, m:] = next_frame[:, 1::2]
-    return blocks, below
+    count = diagonal.shape[1] // size
+    next_frame, second_frame = (
+        torch.nn.functional.pad(factors, (0, 0, 0, size * count - factors.shape[1])).view(tracks, count, size, m)
+        for factors in (next_frame, second_frame)
+    )
+    blocks = diagonal.new_zeros(tracks, count, size, m, size, m)
+    blocks.diagonal(dim1=2, dim2=4).copy_(diagonal.view(tracks, count, size, m, m).permute(0, 1, 3, 4, 2))
+    between = blocks.diagonal(dim1=3, dim2=5)
+    for step, factors in ((1, next_frame), (2, second_frame)):
+        for offset in (step, -step):
+            between.diagonal(offset, dim1=2, dim2=3).copy_(factors[:, :, : size - step].mT)
+    below = diagonal.new_zeros(tracks, count - 1, size, m, size, m)
+    between = below.diagonal(dim1=3, dim2=5)
+    between[:, :, 0, -1] = next_frame[:, :-1, -1]
+    between[:, :, 0, -2], between[:, :, 1, -1] = second_frame[:, :-1, -2], second_frame[:, :-1, -1]
+    return blocks.flatten(4).flatten(2, 3), below.flatten(4).flatten(2, 3)
