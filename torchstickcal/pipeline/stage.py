@@ -11,6 +11,7 @@ from torch import Tensor
 
 from torchstickcal.config import Stage
 from torchstickcal.losses import Loss
+from torchstickcal.model.chance import agreeing_by_chance
 from torchstickcal.model.measurements import Measurements
 from torchstickcal.model.noise import NEAR_SIGMAS, near_keypoints
 from torchstickcal.model.objective import Objective
@@ -109,8 +110,8 @@ def run_stage(
     sigma_px = near.sigma_px(measurements, squared_residuals)
     if stage.reject_sigmas is not None:
         limits = (stage.reject_sigmas * sigma_px).square().to(squared_residuals)
-        agreeing = measurements.by_frame(squared_residuals) <= limits[:, None, None]
-        measurements = measurements.keeping(agreeing.flatten(2))
+        agreeing = (measurements.by_frame(squared_residuals) <= limits[:, None, None]).flatten(2) & measurements.visible
+        measurements = measurements.keeping(agreeing & ~agreeing_by_chance(measurements, state, agreeing)[:, None])
     noise = run.noise_of(stage)
     chosen = near if stage.cameras == "free" else noise.chosen(measurements, lambda: near)
     losses, levels, gates = noise.decided(measurements, state, squared_residuals, chosen)

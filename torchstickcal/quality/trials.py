@@ -154,7 +154,11 @@ def without(evidence: Evidence, camera: int) -> Rest | None:
     groups = evidence.config.camera_groups
     config = replace(evidence.config, camera_groups=[groups[other] for other in others] if groups else [])
     observations = evidence.ended.labels.applied(evidence.observations) if _synchronous(evidence) else evidence.observations
-    ended = tried(observations.of_cameras(others), config, evidence.ended.refined)
+    try:
+        rest = observations.of_cameras(others)
+    except CalibrationError:  # no two of them see the stick
+        return None
+    ended = tried(rest, config, evidence.ended.refined)
     if ended is None:
         return None
     known = ended.kept.active[0]
