@@ -18,7 +18,7 @@ from torchstickcal.pipeline.adjust import adjust_cameras, begin
 from torchstickcal.pipeline.initialise import initialise
 from torchstickcal.pipeline.initialise.graph import Edge, propagate, spanning_tree
 from torchstickcal.pipeline.initialise.pairs import Pair, RelativePose, relate
-from torchstickcal.pipeline.initialise.triangulate import triangulate
+from torchstickcal.geometry.triangulation import triangulate
 from torchstickcal.pipeline.initialise.views import Views
 from torchstickcal.pipeline.run import Run
 from torchstickcal.simulate import Lens, Noise, SessionSpec, golf_session

@@ -13,7 +13,7 @@ from torchstickcal.model.measurements import Measurements
 from torchstickcal.model.state import State
 from torchstickcal.pipeline.initialise.graph import propagate, spanning_tree
 from torchstickcal.pipeline.initialise.pairs import relate
-from torchstickcal.pipeline.initialise.triangulate import triangulate_robustly
+from torchstickcal.geometry.triangulation import triangulate_robustly
 from torchstickcal.pipeline.initialise.views import Views
 
 __all__ = ["initialise", "triangulated"]

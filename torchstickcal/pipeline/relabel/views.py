@@ -9,7 +9,7 @@ from torch import Tensor
 
 from torchstickcal.model.measurements import Measurements
 from torchstickcal.model.state import State
-from torchstickcal.pipeline.initialise.triangulate import triangulate
+from torchstickcal.geometry.triangulation import triangulate
 
 _KERNEL_SIGMAS = 8.0
 _ITERATIONS = 8
