@@ -12,8 +12,8 @@ import torch
 from numpy.typing import NDArray
 
 from torchstickcal.errors import RigError
-from torchstickcal.pipeline.initialise.pairs import Pair, RelativePose, two_view_depths
 from torchstickcal.geometry.triangulation import triangulate, triangulate_robustly
+from torchstickcal.pipeline.initialise.pairs import Pair, RelativePose, two_view_depths
 from torchstickcal.pipeline.initialise.views import Array, Views, spread
 
 _PLAUSIBLE_SHARE = 0.5

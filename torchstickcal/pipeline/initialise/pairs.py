@@ -73,6 +73,7 @@ def relate(views: Views, first: int, second: int, *, max_points: int, threshold_
     threshold = threshold_px / float(np.sqrt(views.focal_px[first] * views.focal_px[second]))
     sample = spread(a.shape[1], max_points)
     essential, inliers = _fitted(a, b, sample, threshold, _MAX_ROUNDS)
+
     def agreement(fitted: tuple[Array | None, NDArray[np.intp]]) -> float:
         return 0.0 if fitted[0] is None else _agreement(fitted[0], a, b, threshold)
 
