@@ -12,13 +12,13 @@ import torch
 
 from torchstickcal import Observations, RigError, calibrate, errors, metrics
 from torchstickcal.config import InitialiseSettings, load_config
+from torchstickcal.geometry.triangulation import triangulate
 from torchstickcal.model.measurements import Measurements
 from torchstickcal.model.state import State
 from torchstickcal.pipeline.adjust import adjust_cameras, begin
 from torchstickcal.pipeline.initialise import initialise
 from torchstickcal.pipeline.initialise.graph import Edge, propagate, spanning_tree
 from torchstickcal.pipeline.initialise.pairs import Pair, RelativePose, relate
-from torchstickcal.pipeline.initialise.triangulate import triangulate
 from torchstickcal.pipeline.initialise.views import Views
 from torchstickcal.pipeline.run import Run
 from torchstickcal.simulate import Lens, Noise, SessionSpec, golf_session

@@ -39,9 +39,9 @@ from torchstickcal.solvers import StageRecord
 _INITIALISE, _RELABEL = "initialise", "relabel"
 _MAX_RELABELLINGS = 3
 _MOST_ROUNDS = 6
-_LARGE_ERRORS, _CLEARLY_LESS = 0.002, 0.9
-"""Root of the lower quartile of the squared residuals, as a fraction of the focal length, from which on a scene may be taken
-for its reverse; and ratio of two such quartiles that says so."""
+_ALIKE, _CLEARLY_LESS = 4.0, 0.9
+"""Ratio of the lower quartiles of the squared residuals of two scenes, below which their images are alike; and the ratio that
+says that one of them is wrong."""
 _EXACT = 1e-5
 """Cost tolerance of the stage for this comparison."""
 _MOST_SORTED = 100_003
@@ -483,22 +483,22 @@ def _on_the_right_side(stages: Sequence[tuple[str, Stage]], ended: Adjustment, r
     """Sessions after some stages, or after the same from reversed depths where the views then clearly fit together better.
 
     Images of a distant scene look almost alike if its depths are reversed (Necker's cube). With large errors the start may be
-    on the wrong side, and an adjustment does not leave it. Where the errors are small, no scene looks like its reverse.
+    on the wrong side, and an adjustment does not leave it. A scene that fits much better than its reverse is none.
     """
-    squared = _small_squared_residuals(ended)
-    large = squared > (_LARGE_ERRORS * ended.measurements.cameras.focal_px.mean(1)).square()
-    if not bool(large.any()):
+    squared, reverse = _small_squared_residuals(ended), ended.state.depth_reversed(ended.measurements.active)
+    alike = _small_squared_residuals(replace(ended, state=reverse)) < _ALIKE * squared
+    if not bool(alike.any()):
         return ended
     exact = [(name, replace(stage, cost_tolerance=min(stage.cost_tolerance, _EXACT))) for name, stage in stages]
 
     def again(state: State) -> Adjustment:
         return through(exact, replace(ended, state=state, results=(), records=((),) * ended.seen.sessions), run)
 
-    others = again(ended.state.depth_reversed(ended.measurements.active))
+    others = again(reverse)
     closer = _small_squared_residuals(others) < squared
-    if not bool((large & closer).any()):
+    if not bool((alike & closer).any()):
         return ended
-    better = large & closer & (_small_squared_residuals(others) < _CLEARLY_LESS * _small_squared_residuals(again(ended.state)))
+    better = alike & closer & (_small_squared_residuals(others) < _CLEARLY_LESS * _small_squared_residuals(again(ended.state)))
     return ended.replaced(better, others) if bool(better.any()) else ended
 
 

@@ -12,6 +12,7 @@ from torch import Tensor
 from torchstickcal.config import Stage
 from torchstickcal.errors import CalibrationError
 from torchstickcal.losses import Loss
+from torchstickcal.model.by_motion import found_by_motion
 from torchstickcal.model.measurements import Measurements
 from torchstickcal.model.noise import NEAR_SIGMAS, near_keypoints
 from torchstickcal.model.objective import Objective
@@ -111,8 +112,11 @@ def run_stage(
     sigma_px = near.sigma_px(measurements, squared_residuals)
     if stage.reject_sigmas is not None:
         limits = (stage.reject_sigmas * sigma_px).square().to(squared_residuals)
-        agreeing = measurements.by_frame(squared_residuals) <= limits[:, None, None]
-        measurements = measurements.keeping(agreeing.flatten(2))
+        agreeing = (measurements.by_frame(squared_residuals) <= limits[:, None, None]).flatten(2) & measurements.visible
+        found, agreeing = found_by_motion(measurements, state, agreeing, limits)
+        measurements = measurements.keeping(agreeing)
+        if found is not state:
+            state, squared_residuals = found, measurements.squared_residuals(found)
     noise = run.noise_of(stage)
     chosen = near if stage.cameras == "free" else noise.chosen(measurements, lambda: near)
     losses, levels, gates = noise.decided(measurements, state, squared_residuals, chosen)

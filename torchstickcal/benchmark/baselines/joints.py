@@ -7,10 +7,10 @@ from collections.abc import Sequence
 from torch import Tensor
 
 from torchstickcal.benchmark.baselines.base import Inputs, required
+from torchstickcal.geometry.triangulation import triangulate
 from torchstickcal.model.measurements import Measurements
 from torchstickcal.model.state import State
 from torchstickcal.observations import Observations
-from torchstickcal.pipeline.initialise.triangulate import triangulate
 from torchstickcal.pipeline.scale import Ruler, check_scale, scale_factors
 
 _TRIANGULATION_RADIUS_PX = 40.0

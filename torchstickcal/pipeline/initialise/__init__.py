@@ -9,11 +9,11 @@ import torch
 from torch import Tensor
 
 from torchstickcal.config import InitialiseSettings
+from torchstickcal.geometry.triangulation import triangulate_robustly
 from torchstickcal.model.measurements import Measurements
 from torchstickcal.model.state import State
 from torchstickcal.pipeline.initialise.graph import propagate, spanning_tree
 from torchstickcal.pipeline.initialise.pairs import relate
-from torchstickcal.pipeline.initialise.triangulate import triangulate_robustly
 from torchstickcal.pipeline.initialise.views import Views
 
 __all__ = ["initialise", "triangulated"]

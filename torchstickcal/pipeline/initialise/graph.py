@@ -12,8 +12,8 @@ import torch
 from numpy.typing import NDArray
 
 from torchstickcal.errors import RigError
+from torchstickcal.geometry.triangulation import triangulate, triangulate_robustly
 from torchstickcal.pipeline.initialise.pairs import Pair, RelativePose, two_view_depths
-from torchstickcal.pipeline.initialise.triangulate import triangulate, triangulate_robustly
 from torchstickcal.pipeline.initialise.views import Array, Views, spread
 
 _PLAUSIBLE_SHARE = 0.5
@@ -106,9 +106,9 @@ def propagate(edges: Sequence[Edge], views: Views, scale: float) -> tuple[Array,
     An essential matrix allows four poses. The number of points in front of both cameras does not always identify the true pose
     among them: the twisted pair can have as many. A third camera decides, because the wrong pose projects the points elsewhere
     in it. So the cameras are placed once for every plausible pose of the first edge. At each further edge, the pose with the
-    largest support by the points known so far is used. Of these rigs, the one with the largest total support is kept, and each
-    of its cameras that the points of the others contradict is placed again. A few hundred points, evenly spaced in the session,
-    are sufficient.
+    largest support by the points known so far is used. Of these rigs, the one with the largest total support is kept. Where the
+    points of the others contradict a camera, all is done with steady keypoints alone, and each camera that is contradicted then
+    is placed again. A few hundred points, evenly spaced in the session, are sufficient.
 
     Args:
         edges: the spanning tree.
@@ -116,39 +116,67 @@ def propagate(edges: Sequence[Edge], views: Views, scale: float) -> tuple[Array,
         scale: scale of the robust kernel, in normalised image coordinates.
     """
     columns = np.flatnonzero(views.visible.any(0))
-    rays, visible = views.rays(list(range(len(views.visible))), columns[spread(len(columns), _MAX_POINTS)])
+    columns = columns[spread(len(columns), _MAX_POINTS)]
+    rays, visible = views.rays(list(range(len(views.visible))), columns)
     first = edges[0].poses
     plausible = [pose for pose in first if pose.in_front >= _PLAUSIBLE_SHARE * first[0].in_front]
-    rigs = [_place_cameras(root, edges, rays, visible, scale) for root in plausible]
-    _, rotations, translations = max(rigs, key=lambda rig: rig[0])
-    _place_again(rotations, translations, rays, visible, scale)
+
+    def placed() -> tuple[Array, Array]:
+        rigs = [_place_cameras(root, edges, rays, visible, scale) for root in plausible]
+        return max(rigs, key=lambda rig: rig[0])[1:]
+
+    rotations, translations = placed()
+    if _doubtful(rotations, translations, rays, visible, scale):
+        steady = visible & views.steady[:, columns]
+        if steady.sum(1).min() >= _MIN_POINTS:
+            visible = steady
+            rotations, translations = placed()
+        _place_again(rotations, translations, rays, visible, scale)
     from_first = rotations @ rotations[0].T
     from_first[0] = np.eye(3)
     return from_first, translations - from_first @ translations[0]
 
 
+def _doubtful(rotations: Array, translations: Array, rays: Array, visible: NDArray[np.bool_], scale: float) -> list[int]:
+    """The cameras that the points of all others contradict, the least supported first; none of two."""
+    shares: dict[int, float] = {}
+    for camera in range(len(rays)) if len(rays) > 2 else ():
+        # points that most views agree on take longer, and are needed only where plain ones do not do
+        plain = _supported(camera, rotations, translations, rays, visible, scale, triangulate).share
+        if plain < _SOUND_SHARE:
+            shares[camera] = _supported(camera, rotations, translations, rays, visible, scale).share
+    return [camera for camera in sorted(shares, key=lambda c: shares[c]) if shares[camera] < _SOUND_SHARE]
+
+
 def _place_again(rotations: Array, translations: Array, rays: Array, visible: NDArray[np.bool_], scale: float) -> None:
-    """Place cameras anew, in place, by the points of all others, the least supported first (perspective-n-point, RANSAC)."""
-    cameras = range(len(rays))
-    for _ in range(_PLACING_ROUNDS if len(rays) > 2 else 0):
-        shares: dict[int, float] = {}
-        for camera in cameras:  # points that most views agree on take longer, and are needed only where plain ones do not do
-            plain = _supported(camera, rotations, translations, rays, visible, scale, triangulate).share
-            if plain < _SOUND_SHARE:
-                shares[camera] = _supported(camera, rotations, translations, rays, visible, scale).share
-        doubtful = [camera for camera in sorted(shares, key=lambda c: shares[c]) if shares[camera] < _SOUND_SHARE]
+    """Place cameras anew, in place, by the points of all others, the least supported first (perspective-n-point, RANSAC).
+
+    A new place must be better for the camera, and no worse for all cameras together: where few points are right, the wrong ones
+    can be enough for a camera alone.
+    """
+
+    def supports() -> list[_Support]:
+        return [_supported(camera, rotations, translations, rays, visible, scale) for camera in range(len(rays))]
+
+    for _ in range(_PLACING_ROUNDS):
+        doubtful = _doubtful(rotations, translations, rays, visible, scale)
         if not doubtful:
             return
+        before = supports()
         for camera in doubtful:
-            before = _supported(camera, rotations, translations, rays, visible, scale)
-            if len(before.seen) < _MIN_POINTS:
+            own = before[camera]
+            if len(own.seen) < _MIN_POINTS:
                 continue
-            pose = _resected(before.known[:, before.seen], rays[camera][:, before.seen], scale)
+            pose = _resected(own.known[:, own.seen], rays[camera][:, own.seen], scale)
             if pose is None:
                 continue
             kept = rotations[camera].copy(), translations[camera].copy()
             rotations[camera], translations[camera] = pose
-            if _supported(camera, rotations, translations, rays, visible, scale).share < before.share + _CLEAR_GAIN:
+            after = supports()
+            better = after[camera].share >= own.share + _CLEAR_GAIN
+            if better and sum(support.share for support in after) > sum(support.share for support in before):
+                before = after
+            else:
                 rotations[camera], translations[camera] = kept
 
 

@@ -14,8 +14,8 @@ _RANSAC_CONFIDENCE = 0.9999
 _MAX_ROUNDS = 1000
 _PATIENT_ROUNDS = 20_000
 """Rounds of RANSAC, and rounds where few points are inliers: five that are have then to be drawn together."""
-_FEW_INLIERS = 0.5
-"""Share of inliers below which RANSAC is run again with more points and rounds."""
+_MANY_INLIERS, _FEW_INLIERS = 0.8, 0.5
+"""Shares of inliers below which RANSAC is run again with the steady points, and with more points and rounds."""
 _MAX_COUNTED_POINTS = 1000
 """Number of points among which the inliers are counted."""
 _MIN_POINTS = 8
@@ -67,14 +67,22 @@ def relate(views: Views, first: int, second: int, *, max_points: int, threshold_
         threshold_px: largest distance of an inlier from its epipolar line.
     """
     columns = np.flatnonzero(views.visible[first] & views.visible[second])
-    (a, b), seen = views.rays([first, second], columns[spread(len(columns), _MAX_COUNTED_POINTS)])
-    a, b = a[:, seen.all(0)], b[:, seen.all(0)]
+    counted = columns[spread(len(columns), _MAX_COUNTED_POINTS)]
+    (a, b), seen = views.rays([first, second], counted)
+    counted, a, b = counted[seen.all(0)], a[:, seen.all(0)], b[:, seen.all(0)]
     threshold = threshold_px / float(np.sqrt(views.focal_px[first] * views.focal_px[second]))
     sample = spread(a.shape[1], max_points)
     essential, inliers = _fitted(a, b, sample, threshold, _MAX_ROUNDS)
+
+    def agreement(fitted: tuple[Array | None, NDArray[np.intp]]) -> float:
+        return 0.0 if fitted[0] is None else _agreement(fitted[0], a, b, threshold)
+
+    if len(inliers) < _MANY_INLIERS * a.shape[1]:
+        steady = np.flatnonzero(views.steady[first, counted] & views.steady[second, counted])
+        essential, inliers = max((essential, inliers), _fitted(a, b, steady, threshold, _MAX_ROUNDS), key=agreement)
     if len(inliers) < _FEW_INLIERS * a.shape[1]:
-        patient, more = _fitted(a, b, spread(a.shape[1], _MAX_COUNTED_POINTS), threshold, _PATIENT_ROUNDS)
-        essential, inliers = (patient, more) if len(more) > len(inliers) else (essential, inliers)
+        every = np.arange(a.shape[1])
+        essential, inliers = max((essential, inliers), _fitted(a, b, every, threshold, _PATIENT_ROUNDS), key=agreement)
     if essential is None:
         return Pair(len(columns), 0, 0.0, ())
     sampled_inliers = inliers[spread(len(inliers), max_points)]
@@ -107,6 +115,11 @@ def _fitted(
         return None, np.zeros(0, np.intp)
     essential = np.asarray(found[:3], dtype=np.float64)
     return essential, np.flatnonzero(_sampson_distance(essential, a, b) < threshold)
+
+
+def _agreement(essential: Array, a: Array, b: Array, threshold: float) -> float:
+    """How many pairs of points fit an essential matrix, each counted the less the larger its distance is (MSAC)."""
+    return float((1 - (_sampson_distance(essential, a, b) / threshold) ** 2).clip(0).sum())
 
 
 def _sampson_distance(essential: Array, a: Array, b: Array) -> Array:

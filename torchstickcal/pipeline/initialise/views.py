@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
+from torchstickcal.lazy import cached_property
 from torchstickcal.model.measurements import Measurements
 
 Array = NDArray[np.float64]
@@ -12,6 +14,10 @@ Array = NDArray[np.float64]
 _MAX_CACHED_KEYPOINTS = 500_000
 """Number of keypoints of a session up to which all are undistorted at once. In longer sessions each sample is undistorted when
 it is requested."""
+_NEIGHBOURS = 2
+"""Frames before and after in which a keypoint's neighbours in time are looked for."""
+_STEADY_RATIO = 4.0
+"""Distance to the nearest neighbour in time, relative to the lower quartile of its camera, up to which a keypoint is steady."""
 
 
 class Views:
@@ -33,6 +39,23 @@ class Views:
         """Number of common points of each pair of cameras, (C, C)."""
         count = len(self.visible)
         return np.array([[np.count_nonzero(self.visible[i] & self.visible[j]) for j in range(count)] for i in range(count)])
+
+    @cached_property
+    def steady(self) -> NDArray[np.bool_]:
+        """Keypoints (C, N) near those of the same point in the same camera one or two frames before or after.
+
+        Of wrong keypoints only those are that are wrong in the same way for several frames.
+        """
+        m = self._measurements
+        pixels = m.by_frame(m.pixels[0].double()).where(m.by_frame(m.visible[0])[:, None], torch.nan).cpu().numpy()
+        nearest = np.full_like(pixels[:, 0], np.inf)
+        for step in range(1, _NEIGHBOURS + 1):
+            apart = np.hypot(*np.moveaxis(pixels[:, :, step:] - pixels[:, :, :-step], 1, 0))
+            for own in (nearest[:, step:], nearest[:, :-step]):
+                np.fmin(own, apart, out=own)
+        nearest = nearest.reshape(len(nearest), -1)
+        quartile = [np.quantile(of[np.isfinite(of)], 0.25) if np.isfinite(of).any() else 0.0 for of in nearest]
+        return nearest <= _STEADY_RATIO * np.array(quartile)[:, None]
 
     def rays(self, cameras: list[int], columns: NDArray[np.intp]) -> tuple[Array, NDArray[np.bool_]]:
         """Normalised image coordinates (c, 2, n) of n columns in c cameras, and which of them are seen (c, n).

@@ -7,9 +7,9 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
+from torchstickcal.geometry.triangulation import triangulate
 from torchstickcal.model.measurements import Measurements
 from torchstickcal.model.state import State
-from torchstickcal.pipeline.initialise.triangulate import triangulate
 
 _KERNEL_SIGMAS = 8.0
 _ITERATIONS = 8

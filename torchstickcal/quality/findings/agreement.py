@@ -104,7 +104,7 @@ def _same_views(evidence: Evidence) -> Iterator[Finding]:
         common = measurements.visible[0, first] & measurements.visible[0, second]
         if bool(common.any()):
             apart = (rays[first] - rays[second])[:, common].square().sum(0).sqrt()
-            angles[first, second] = float(apart.mean())
+            angles[first, second] = float(apart.median())
     same = {pair: angle for pair, angle in angles.items() if angle < _SAME_VIEW_RAD}
     for (first, second), angle in same.items():
         names = (evidence.camera(first), evidence.camera(second))
