@@ -300,6 +300,8 @@ def _add_detectors(command: argparse.ArgumentParser) -> None:
         help="videos: colours of tape or balls on the stick's ends, the end in the hands first: red, orange, yellow, green, "
         "cyan, blue, magenta; the cameras must stand still",
     )
+    help = "videos: find a stick without marks as a line from the hands, by the body's keypoints; the cameras must stand still"
+    add("--shaft", action="store_true", help=help)
 
 
 def _add_analyse(commands: Any) -> None:
