@@ -526,6 +526,14 @@ def _add_recording(command: argparse.ArgumentParser) -> None:
         help="a stick: two points and the metres between them; may be given several times (default: the session's)",
     )
     add(
+        "--stick-offset",
+        metavar=("POINT", "METRES"),
+        nargs=2,
+        action="append",
+        help="how far inside the stick this end of a --stick is detected: a grip that the hands hide; `unknown` to estimate "
+        "it, where another stick sets the scale",
+    )
+    add(
         "--stick-points", metavar="PATH", type=_path, help="keypoints of the stick's ends, where they are in files of their own"
     )
     add("--turned", choices=("left", "right", "back"), help="images were turned so after the calibration: left, right, or back")
