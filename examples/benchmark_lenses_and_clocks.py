@@ -88,7 +88,7 @@ def row(outcomes: list[Outcome]) -> str:
     ratios = [outcome.error_m / outcome.reference_m for outcome in outcomes]
     mean, reference = (statistics.fmean(getattr(o, part) for o in outcomes) for part in ("error_m", "reference_m"))
     normalised = np.concatenate([outcome.normalised for outcome in outcomes])
-    spread = f"{np.mean(normalised**2):.2f} | {np.mean(np.abs(normalised) < 3):.1%}" if len(normalised) else "- | -"
+    spread = f"{np.mean(normalised**2):.2f} | {100 * np.mean(np.abs(normalised) < 3):.1f} %" if len(normalised) else "- | -"
     seconds = statistics.median(outcome.seconds for outcome in outcomes)
     return f"{1000 * mean:.2f} | {mean / reference:.2f} | {max(ratios):.2f} | {spread} | {seconds:.2f}"
 
@@ -99,14 +99,14 @@ def lenses(cameras: int) -> Iterator[Row]:
     yield "nothing", (), lens_row(spec, ())
     for scale in (1.03, 0.97, 1.1, 0.9):
         wrong = replace(spec, assumptions=Assumptions(focal_scale=scale))
-        yield f"all focal lengths {scale - 1:+.0%}", ("focal_shared",), lens_row(wrong, ("focal_shared",))
+        yield f"all focal lengths {100 * (scale - 1):+.0f} %", ("focal_shared",), lens_row(wrong, ("focal_shared",))
     for spread in (0.03, 0.1):
         wrong = replace(spec, assumptions=Assumptions(focal_spread=spread))
-        yield f"each focal length differently, std {spread:.0%}", ("focal",), lens_row(wrong, ("focal",))
+        yield f"each focal length differently, std {100 * spread:.0f} %", ("focal",), lens_row(wrong, ("focal",))
     wrong = replace(spec, lens=BARREL, assumptions=Assumptions(lens_known=False))
     yield "k1 = -0.2, given as 0", ("radial",), lens_row(wrong, ("radial",))
     wrong = replace(spec, assumptions=Assumptions(focal_scale=1.03))
-    yield "all focal lengths +3%", ("auto",), lens_row(wrong, ("focal_shared",), "auto")
+    yield "all focal lengths +3 %", ("auto",), lens_row(wrong, ("focal_shared",), "auto")
     yield "only the image size is given", ("focal_shared",), lens_row(spec, ("focal_shared",), (), without_intrinsics)
 
 

@@ -1,6 +1,6 @@
 """How well the verdict on a calibration knows: sound and bad sessions, cameras that move, and lengths that took no part.
 
-    python examples/benchmark_quality.py --sound 100 --bad 200 --steps 60 --lengths 60
+    python examples/benchmark_quality.py --sound 100 --bad 200 --pairs 50 --steps 60 --lengths 60
 
 Every table is printed as soon as it is complete. All sessions are simulated, so that the truth is known.
 """
@@ -113,14 +113,14 @@ class Kind:
         codes: of the findings that name the cause.
         tellable: whether the keypoints can tell.
         cameras: least number of cameras.
-        elsewhere: whether the camera is not where the session has it, so that its place is not compared.
+        elsewhere: the cameras, counted from the bad one, that are not where the session has them and so are not compared.
     """
 
     make: Callable[[SimulatedSession, int, np.random.Generator], Observations]
     codes: tuple[str, ...]
     tellable: bool = True
     cameras: int = 3
-    elsewhere: bool = False
+    elsewhere: tuple[int, ...] = ()
 
 
 def with_camera(observations: Observations, camera: int, keypoints: torch.Tensor) -> Observations:
@@ -233,6 +233,7 @@ def wrong_forearm(given: SimulatedSession) -> Observations:
     return replace(given.observations, sticks=[*given.observations.sticks, Stick(elbow, wrist, 1.2 * length)])
 
 
+ALIEN = ("camera_alien", "other_person", "little_in_common")
 MOVED = ("camera_moved", "camera_drifted")
 CLOCK = ("clock_apart", "unsynchronised", "time_offset_contradicted", "time_offset_uncertain")
 LENS = ("focal_contradicted", "intrinsics_other_resolution", "principal_point_off_centre", "intrinsics_turned")
@@ -244,8 +245,8 @@ KINDS: dict[str, Kind] = {
     "all cameras mirrored": Kind(
         lambda s, c, r: replace(s.observations, keypoints=mirrored(s.observations.keypoints, 1920)), ("scene_mirrored",)
     ),
-    "another person": Kind(lambda s, c, r: another(s, c, r, False), ("camera_alien", "other_person")),
-    "another recording": Kind(lambda s, c, r: another(s, c, r, True), ("camera_alien", "other_person")),
+    "another person": Kind(lambda s, c, r: another(s, c, r, False), ALIEN),
+    "another recording": Kind(lambda s, c, r: another(s, c, r, True), ALIEN),
     "one camera's intrinsics of half resolution": Kind(
         lambda s, c, r: without_size(with_matrix(s.observations, [c], scaled(0.5))), LENS
     ),
@@ -268,27 +269,27 @@ KINDS: dict[str, Kind] = {
     "the same video twice": Kind(
         lambda s, c, r: with_camera(s.observations, c, s.observations.keypoints[(c + 1) % s.observations.num_cameras]),
         SAME,
-        elsewhere=True,
+        elsewhere=(0,),
     ),
     "two cameras at one place": Kind(
-        lambda s, c, r: with_camera(s.observations, c, second_view(s, c, 0.01, r)), SAME, elsewhere=True
+        lambda s, c, r: with_camera(s.observations, c, second_view(s, c, 0.01, r)), SAME, elsewhere=(0,)
     ),
     "no baseline": Kind(lambda s, c, r: no_baseline(s, r), (*SAME, "noise_large"), cameras=2),
     "a camera moved 0.5 degrees": Kind(
-        lambda s, c, r: replace(s.observations, keypoints=knocked(s, c, _half(s, r), 0.5, 0.0, r)), MOVED, elsewhere=True
+        lambda s, c, r: replace(s.observations, keypoints=knocked(s, c, _half(s, r), 0.5, 0.0, r)), MOVED, elsewhere=(0,)
     ),
     "a camera moved 30 mm": Kind(
-        lambda s, c, r: replace(s.observations, keypoints=knocked(s, c, _half(s, r), 0.0, 0.03, r)), MOVED, elsewhere=True
+        lambda s, c, r: replace(s.observations, keypoints=knocked(s, c, _half(s, r), 0.0, 0.03, r)), MOVED, elsewhere=(0,)
     ),
     "a camera moved 8 degrees and 0.3 m": Kind(
-        lambda s, c, r: replace(s.observations, keypoints=knocked(s, c, _half(s, r), 8.0, 0.3, r)), MOVED, elsewhere=True
+        lambda s, c, r: replace(s.observations, keypoints=knocked(s, c, _half(s, r), 8.0, 0.3, r)), MOVED, elsewhere=(0,)
     ),
     "a camera drifted 1 degree": Kind(
         lambda s, c, r: replace(
             s.observations, keypoints=knocked(s, c, torch.linspace(0, 1, s.observations.num_frames).double(), 1.0, 0.0, r)
         ),
         MOVED,
-        elsewhere=True,
+        elsewhere=(0,),
     ),
     "one camera 8 frames late": Kind(lambda s, c, r: later(s, c, 8), CLOCK),
     "one camera lost 6 frames": Kind(lambda s, c, r: dropped(s, c, s.observations.num_frames // 2, 6), (*CLOCK, *MOVED)),
@@ -309,7 +310,18 @@ KINDS: dict[str, Kind] = {
     "sticks that contradict each other": Kind(lambda s, c, r: wrong_forearm(s), ("stick_lengths_contradict",), cameras=2),
     "missing keypoints at (0, 0)": Kind(lambda s, c, r: corner(s, c, r), ("keypoints_at_corner",)),
 }
-"""The kinds of bad sessions. Where several are combined, each of their causes counts as right."""
+"""The kinds of bad sessions."""
+
+
+def combined(first: Kind, second: Kind) -> Kind:
+    """Two kinds at once, of two cameras. The cause of either counts as right, whichever is named first."""
+
+    def made(given: SimulatedSession, camera: int, rng: np.random.Generator) -> Observations:
+        half = replace(given, observations=first.make(given, camera, rng))
+        return second.make(half, (camera + 1) % given.observations.num_cameras, rng)
+
+    elsewhere = (*first.elsewhere, *(1 + number for number in second.elsewhere))
+    return Kind(made, first.codes + second.codes, cameras=4, elsewhere=elsewhere)
 
 
 def _half(given: SimulatedSession, rng: np.random.Generator) -> torch.Tensor:
@@ -383,26 +395,37 @@ def sound(count: int, seed: int, each: Each) -> None:
     alarms = sum(outcome.verdict in ("poor", "failed") for outcome in outcomes)
     usable = collections.Counter(code for o in outcomes for code in o.codes)
     share = [o.judging / o.seconds for o in outcomes if o.seconds and o.verdict in ("good", "usable")]
-    print(f"\nSound sessions: {count}; {dict(verdicts)}; false alarms (poor or failed): {alarms / count:.1%}")
+    print(f"\nSound sessions: {count}; {dict(verdicts)}; false alarms (poor or failed): {100 * alarms / count:.1f} %")
     print(f"findings above notes: {dict(usable)}")
     print(f"confidently wrong: {sum(o.confidently_wrong for o in outcomes)}")
     print(
-        f"time of the judgement over that of the calibration: median {np.median(share):.1%}, mean {np.mean(share):.1%}",
+        f"time of the judgement over that of the calibration: median {100 * np.median(share):.1f} %, "
+        f"mean {100 * np.mean(share):.1f} %",
         flush=True,
     )
 
 
 def _compared(kind: Kind, camera: int, cameras: int) -> list[int]:
     """The cameras whose places are compared."""
-    return [other for other in range(cameras) if not kind.elsewhere or other != camera]
+    return [other for other in range(cameras) if (other - camera) % cameras not in kind.elsewhere]
 
 
 def bad_session(number: int, seed: int) -> Outcome:
     """What is said of one bad session, of the kinds in turn; with clocks and lenses as given, and with ``auto``."""
-    rng = np.random.default_rng((seed, number, 7))
     names = list(KINDS)
     name = names[number % len(names)]
-    kind = KINDS[name]
+    return _said_of(number, np.random.default_rng((seed, number, 7)), name, KINDS[name], bool(number // len(names) % 2))
+
+
+def bad_pair(number: int, seed: int) -> Outcome:
+    """What is said of one session with two bad kinds at once; with clocks and lenses as given, and with ``auto``."""
+    rng = np.random.default_rng((seed, number, 8))
+    single = [name for name, kind in KINDS.items() if kind.tellable and kind.cameras == 3 and not name.startswith("all")]
+    names = [str(name) for name in rng.choice(single, 2, replace=False)]
+    return _said_of(number, rng, " and ".join(names), combined(KINDS[names[0]], KINDS[names[1]]), bool(number % 2))
+
+
+def _said_of(number: int, rng: np.random.Generator, name: str, kind: Kind, auto: bool) -> Outcome:
     cameras = int(rng.integers(kind.cameras, 9))
     given = session(number, rng, cameras, outliers=float(rng.uniform(0, 0.1)))
     camera = int(rng.integers(cameras))
@@ -410,10 +433,26 @@ def bad_session(number: int, seed: int) -> Outcome:
         observations = kind.make(given, camera, rng)
     except CalibrationError as error:
         return Outcome(name, cameras, "refused", [type(error).__name__])
-    outcome = judged(given, observations, bool(number // len(names) % 2), name, _compared(kind, camera, cameras))
+    outcome = judged(given, observations, auto, name, _compared(kind, camera, cameras))
     outcome.right = not kind.codes or bool(outcome.codes and outcome.codes[0] in kind.codes)
     outcome.right |= outcome.verdict in ("good", "usable") and outcome.error_m < 0.01 * outcome.rig_m  # mended by itself
     return outcome
+
+
+def pairs(count: int, seed: int, each: Each) -> None:
+    """Sessions with two bad kinds at once."""
+    outcomes = list(each(partial(bad_pair, seed=seed), range(count)))
+    for number, outcome in enumerate(outcomes):
+        if outcome.confidently_wrong or not outcome.right:
+            print("   ", number, outcome, flush=True)
+    verdicts = collections.Counter(outcome.verdict for outcome in outcomes)
+    named = [outcome.right for outcome in outcomes if outcome.verdict != "refused"]
+    print(f"\nSessions with two kinds at once: {count}; {dict(verdicts)}")
+    print(
+        f"confidently wrong: {sum(o.confidently_wrong for o in outcomes)}; "
+        f"one of the causes first: {sum(named)} of {len(named)}",
+        flush=True,
+    )
 
 
 def bad(count: int, seed: int, each: Each) -> None:
@@ -438,7 +477,7 @@ def bad(count: int, seed: int, each: Each) -> None:
             wrong, counted, right = wrong + own, counted + len(named), right + sum(named)
     print(
         f"confidently wrong, of the kinds that can be recognised: {wrong}; "
-        f"right cause first: {right / max(counted, 1):.0%} of {counted}",
+        f"right cause first: {100 * right / max(counted, 1):.0f} % of {counted}",
         flush=True,
     )
 
@@ -469,12 +508,14 @@ def steps(count: int, seed: int, each: Each) -> None:
         found[label].append(rightly)
     print(
         f"\nSteps of one camera, of {count} sessions of 60 to 160 frames, 3 to 8 cameras; "
-        f"false steps in sound ones: {false / count:.1%}"
+        f"false steps in sound ones: {100 * false / count:.1f} %"
     )
     print(f"{'step':14} {'n':>4} {'found':>6} {'right camera':>13} {'and within 2 frames':>20}")
     for label, values in found.items():
         rates = np.mean(values, axis=0)
-        print(f"{label:14} {len(values):4} {rates[0]:6.0%} {rates[1]:13.0%} {rates[2]:20.0%}", flush=True)
+        print(
+            f"{label:14} {len(values):4} {100 * rates[0]:4.0f} % {100 * rates[1]:11.0f} % {100 * rates[2]:18.0f} %", flush=True
+        )
 
 
 def biased(given: SimulatedSession, rng: np.random.Generator, sigma_px: float) -> Observations:
@@ -506,8 +547,8 @@ def lengths(count: int, seed: int, each: Each) -> None:
         inside, weights, metre = zip(*itertools.chain.from_iterable(one_by_one), strict=True)
         total = np.average(inside, weights=weights)
         print(
-            f"\nLengths that took no part, {len(inside)} sessions, {label}: {total:.1%} inside their 95 % intervals; "
-            f"by session: 5 % below {np.quantile(inside, 0.05):.0%}, median {np.median(inside):.0%}; "
+            f"\nLengths that took no part, {len(inside)} sessions, {label}: {100 * total:.1f} % inside their 95 % intervals; "
+            f"by session: 5 % below {100 * np.quantile(inside, 0.05):.0f} %, median {100 * np.median(inside):.0f} %; "
             f"a metre: median ± {1000 * np.median(metre):.1f} mm",
             flush=True,
         )
@@ -517,12 +558,13 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else "")
     parser.add_argument("--sound", type=int, default=0, metavar="N", help="sound sessions")
     parser.add_argument("--bad", type=int, default=0, metavar="N", help="bad sessions")
+    parser.add_argument("--pairs", type=int, default=0, metavar="N", help="sessions that are bad in two ways at once")
     parser.add_argument("--steps", type=int, default=0, metavar="N", help="sessions with a step")
     parser.add_argument("--lengths", type=int, default=0, metavar="N", help="sessions whose left-out lengths are looked at")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--jobs", type=int, default=1, metavar="N", help="processes")
     options = parser.parse_args()
-    parts = (sound, bad, steps, lengths)
+    parts = (sound, bad, pairs, steps, lengths)
     if not any(getattr(options, part.__name__) for part in parts):
         parser.print_help()
     with ProcessPoolExecutor(options.jobs) as pool:

@@ -89,7 +89,9 @@ def rows(what: str) -> Iterator[Row]:
     elif what == "path":
         yield from ((f"path: {path}", {"path": path}, None, None) for path in ("stay", "circle"))
     elif what == "stick":
-        yield from ((f"stick seen in {share:.0%} of the frames", {}, stick_seen(share), None) for share in (1, 0.3, 0.1, 0.03))
+        yield from (
+            (f"stick seen in {100 * share:.0f} % of the frames", {}, stick_seen(share), None) for share in (1, 0.3, 0.1, 0.03)
+        )
     else:
         pairs = ([0, second] for second in range(1, 7))
         yield from ((f"two cameras, {30 * p[1]} deg apart", {"cameras": 12}, of_cameras(p), p) for p in pairs)

@@ -174,7 +174,7 @@ def main() -> None:
         speed = analyse(calibration, sport).curves["tip_speed"]
         fastest = int(session.speeds[:, 1].argmax())
         print(
-            f"{number} {sport}: ends in {known.mean():.0%} of images, median {np.median(apart[good]):.2f} px "
+            f"{number} {sport}: ends in {100 * known.mean():.0f} % of images, median {np.median(apart[good]):.2f} px "
             f"({np.median(apart[fast]) if fast.any() else 0:.2f} px if fast), {far.sum()} of {known.sum()} wrong, "
             f"fastest {session.speeds.max():.1f} m/s ({streak.max():.0f} px of blur); cameras {mm:.1f} mm, "
             f"with ideal ends {ideal_mm:.1f} mm; speed found {speed.values[fastest]:.1f} +- {speed.std[fastest]:.1f} m/s",
@@ -183,7 +183,7 @@ def main() -> None:
     mean, ideal_mean = np.sqrt(np.square(ratios).mean(0))
     print(
         f"\n{options.sessions} sessions: median error {np.median(np.concatenate(errors)):.2f} px, where fastest "
-        f"{np.median(np.concatenate(fast_errors)):.2f} px; wrong ends {wrong} of {seen} ({wrong / seen:.2%}); cameras "
+        f"{np.median(np.concatenate(fast_errors)):.2f} px; wrong ends {wrong} of {seen} ({100 * wrong / seen:.2f} %); cameras "
         f"{mean:.1f} mm, with ideal ends {ideal_mean:.1f} mm ({mean / ideal_mean:.2f} times)"
     )
 

@@ -12,7 +12,7 @@ points that the calibrated cameras triangulate, and for the points of the sessio
 inside the reported 95 % region: ellipsoid of all cameras, ellipsoid of each new point, interval of each coordinate of a new
 point by ``predict_std``.
 
-A run has failed if more than half of the keypoints of a camera were rejected. Failed runs are counted and left out.
+A run has failed if more than half of the keypoints of a camera were set aside. Failed runs are counted and left out.
 
 Second table: is the calibration as accurate as possible? The mean squared error of the camera centres and rotations, in the
 first camera's frame, is divided by the Cramér-Rao bound of a method that knows the inliers, their noise and the stick's length
@@ -100,7 +100,7 @@ def main() -> None:
             spec = replace(rig, regimes=(Noise(SIGMA_PX, outliers=share),))
             every = [one_run(replace(spec, seed=seed), config) for seed in range(options.runs)]
             runs = [run for run in every if not run.failed]
-            label = f"| {rig.cameras} | {rig.name} | {share:.0%} | {len(every)} | {len(every) - len(runs)} | "
+            label = f"| {rig.cameras} | {rig.name} | {100 * share:.0f} % | {len(every)} | {len(every) - len(runs)} | "
             consistency.append(label + _consistency(runs))
             efficiency.append(label + _efficiency(runs))
     first = "| cameras | sport, layout | outliers | runs | failed | "

@@ -283,7 +283,7 @@ def test_efficiency_and_success():
     assert line[-1] == "3 of 4"
     table = success(rows, "regime", lambda row: row.regime)
     assert table.header == ("method", "hard", "0.1 px")
-    assert table.rows == ((METHODS["default"].title, "33%", "100%"),)
+    assert table.rows == ((METHODS["default"].title, "33 %", "100 %"),)
     assert failures(rows).rows[0][1:] == (FAILED, "no", 1)
 
 

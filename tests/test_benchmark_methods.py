@@ -108,7 +108,7 @@ def test_a_baseline_of_one_s_own_is_in_all_tables(toy: None):
     assert table.note.endswith("[Toy] It is a toy.")
     assert [line[0] for line in inputs(rows).rows] == ["Toy", "Toy, in motion", METHODS["default"].title]
     assert [line[0] for line in efficiency(rows).rows] == [METHODS["default"].title, "Toy", "Toy, in motion"]
-    assert success(rows, "regime", lambda row: row.regime).rows[1] == ("Toy", "100%")
+    assert success(rows, "regime", lambda row: row.regime).rows[1] == ("Toy", "100 %")
     failed = dataclasses.replace(ROW, outcome="not converged", status="why")
     assert failures([failed]).rows == (("Toy", "not converged", "why", 1),)
 

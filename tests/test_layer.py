@@ -280,3 +280,15 @@ def test_lens_models_of_different_length_in_one_batch():
     assert result.status == ("converged", "converged")
     result.points.sum().backward()
     assert (lens.grad.abs().sum(1) > 0).all()
+
+
+@pytest.mark.parametrize("gradient", ["implicit", "gauss_newton", "unrolled"])
+def test_a_session_that_has_not_converged_has_no_gradient(gradient: str):
+    observations, _ = golf_session(cameras=3, frames=6, noise=Noise(1.0))
+    keypoints = observations.keypoints.requires_grad_()
+    config = {"extends": "default", "stages": {"unscaled": {"max_iterations": 1}}}
+    result = CalibrationLayer(observations.sticks, config, gradient)(keypoints, observations.cameras)
+    assert not result.converged
+    result.translations.square().sum().backward()
+    assert keypoints.grad is not None
+    assert bool((keypoints.grad == 0).all())

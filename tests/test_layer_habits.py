@@ -9,6 +9,7 @@ import subprocess
 import sys
 import warnings
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import pytest
@@ -19,8 +20,17 @@ from torch.func import functional_call, grad, hessian, jacfwd, jacrev, jvp, vjp,
 from torch.utils import _pytree as pytree
 from torch.utils.checkpoint import checkpoint
 
-from torchstickcal import CalibrationError, CalibrationLayer, ConfigError, Intrinsics, LayerResult, ObservationError, Stick
-from torchstickcal.simulate import Noise, golf_session
+from torchstickcal import (
+    CalibrationError,
+    CalibrationLayer,
+    ConfigError,
+    Intrinsics,
+    LayerResult,
+    ObservationError,
+    Stick,
+    calibrate,
+)
+from torchstickcal.simulate import Noise, SessionSpec, golf_session
 
 OBSERVATIONS, _ = golf_session(cameras=3, frames=8, noise=Noise(sigma_px=1.0, missing=0.03))
 KEYPOINTS, LENS, STICK = OBSERVATIONS.keypoints, OBSERVATIONS.cameras, OBSERVATIONS.sticks[0]
@@ -352,3 +362,33 @@ def test_nothing_of_all_this_warns():
         keypoints = SESSIONS.clone().requires_grad_()
         LAYER(keypoints, LENS).translations.sum().backward()
         vmap(grad(linear))(SESSIONS)
+
+
+def test_a_layer_judges_its_sessions_as_calibrate_does():
+    given = SessionSpec("s", "golf", 1, cameras=4, frames=30, layout="ring", regimes=(Noise(1.0),)).generate().observations
+    mirrored = given.keypoints.clone()
+    mirrored[2, ..., 0] = 1919 - mirrored[2, ..., 0]
+    keypoints = torch.stack([given.keypoints, mirrored, torch.full_like(mirrored, torch.nan)]).requires_grad_()
+    result = CalibrationLayer(given.sticks, point_names=given.point_names, judge=True)(keypoints, given.cameras)
+    assert result.verdict is not None
+    assert result.agreement is not None
+    assert result.metre_m is not None
+    assert result.qualities is not None
+    assert result.verdict.tolist() == [0, 2, 3]
+    assert result.agreement.shape == (3, 4)
+    assert bool((result.agreement[0] > 0.95).all())
+    assert int(result.agreement[1].argmin()) == 2
+    assert [quality.findings[0].code for quality in result.qualities[1:]] == ["camera_mirrored", "not_calibrated"]
+    alone = calibrate(replace(given, image_size=None, fps=None)).quality
+    assert alone.acceptance is not None
+    assert float(result.metre_m[0]) == pytest.approx(alone.acceptance.metre_m, rel=1e-3)
+    assert result[1].qualities == result.qualities[1:2]
+    assert [int(one.verdict) for one in result if one.verdict is not None] == [0, 2, 3]
+    again = pytree.tree_map(lambda tensor: tensor.detach(), result)
+    file = io.BytesIO()
+    torch.save(again, file)
+    file.seek(0)
+    assert torch.load(file, weights_only=True).qualities == result.qualities
+    result.translations.sum().backward()
+    assert keypoints.grad is not None
+    assert LAYER(KEYPOINTS, LENS).verdict is None

@@ -9,6 +9,8 @@ from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
+from types import SimpleNamespace
+from typing import cast
 
 import pytest
 import torch
@@ -19,12 +21,17 @@ from torchstickcal.cli import main
 from torchstickcal.errors import ObservationError
 from torchstickcal.geometry import se3
 from torchstickcal.io import load_session, write_npz
+from torchstickcal.model.unknowns import all_unknowns
+from torchstickcal.quality.evidence import Evidence
+from torchstickcal.quality.findings.unknowns import _contradicted, _little_in_common
 from torchstickcal.quality.lags import frames_are_apart
 from torchstickcal.quality.linear import FramePulls
 from torchstickcal.quality.moved import motion_of
 from torchstickcal.quality.registry import FAMILIES, findings
 from torchstickcal.quality.resection import resected
-from torchstickcal.simulate import Noise, SessionSpec, SimulatedSession
+from torchstickcal.quality.trials import without
+from torchstickcal.result import CameraParameter
+from torchstickcal.simulate import Noise, SessionSpec, SimulatedSession, golf_session
 from torchstickcal.solvers.elimination.normal_equations import NormalEquations
 
 
@@ -74,14 +81,21 @@ def mirrored(keypoints: Tensor) -> Tensor:
     return torch.stack([1919 - keypoints[..., 0], keypoints[..., 1]], dim=-1)
 
 
+def corner_points(keypoints: Tensor) -> Tensor:
+    """Every third keypoint marked as missing by zeros."""
+    return torch.where((torch.arange(keypoints.shape[1]) % 3 == 0)[:, None], 0.0, keypoints)
+
+
 @pytest.mark.parametrize(
     ("change", "code"),
     [
         (lambda s: with_camera(s.observations, 2, mirrored), "camera_mirrored"),
         (lambda s: with_camera(s.observations, 0, mirrored), "camera_mirrored"),
         (lambda s: replace(s.observations, keypoints=mirrored(s.observations.keypoints)), "scene_mirrored"),
-        (lambda s: with_camera(replace(s.observations, image_size=None), 1, lambda k: k / 2), "focal_contradicted"),
+        (lambda s: with_camera(replace(s.observations, image_size=None), 1, lambda k: k / 2), "intrinsics_other_resolution"),
+        (lambda s: with_camera(replace(s.observations, image_size=None), 0, lambda k: 2 * k), "intrinsics_other_resolution"),
         (lambda s: with_camera(s.observations, 3, lambda k: s.observations.keypoints[1]), "same_video"),
+        (lambda s: with_camera(s.observations, 2, corner_points), "keypoints_at_corner"),
         (lambda s: s.observations.with_stick_length(3.28), "athlete_height"),
         (lambda s: replace(s.observations, sticks=[*s.observations.sticks, Stick(0, 1, 0.5)]), "stick_lengths_contradict"),
         (lambda s: knocked(s, 2, 25, 0.5, 0.0), "camera_moved"),
@@ -94,6 +108,107 @@ def test_the_cause_is_named_first(change: Callable[[SimulatedSession], Observati
     assert quality.verdict in (Verdict.POOR, Verdict.FAILED)
     assert codes(quality)[0] == code
     assert quality.findings[0].is_cause
+
+
+def test_missing_keypoints_at_the_corner_do_not_make_a_camera_doubtful():
+    calibration = calibrate(with_camera(session(cameras=3, frames=30).observations, 1, corner_points))
+    agreement = evidence_of(calibration).agreement
+    assert float(agreement.min()) > 0.85
+    assert "camera_doubtful" not in codes(calibration.quality)
+
+
+def evidence_of(calibration: Calibration) -> Evidence:
+    assert isinstance(calibration.judgement, partial)
+    return calibration.judgement.args[0]
+
+
+@pytest.mark.parametrize(("cameras", "frames"), [(3, 20), (5, 80)])
+def test_keypoints_without_noise_are_no_motion_of_a_camera(cameras: int, frames: int):
+    quality = calibrate(golf_session(cameras=cameras, frames=frames)[0]).quality
+    assert quality.verdict is Verdict.GOOD
+
+
+@pytest.mark.parametrize("seed", [2, 10])
+def test_errors_that_stay_are_no_motion_of_a_camera(seed: int):
+    """A detector that places each joint differently in each view."""
+    given = session(cameras=4, frames=80, seed=seed)
+    offsets = 6.0 * torch.randn(4, 1, 21, 2, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+    offsets[:, :, -2:] = 0.0
+    calibration = calibrate(replace(given.observations, keypoints=given.observations.keypoints + offsets))
+    evidence = evidence_of(calibration)
+    biased = FramePulls.of(evidence.measurements, evidence.state, evidence.ended.last.sigma_px)
+    as_motion = motion_of(biased, evidence.state.rotations[0], evidence.state.translations[0])
+    assert evidence.constant_errors_sigmas > 0.5
+    assert evidence.motion is not None
+    assert as_motion is not None
+    assert evidence.motion.evidence < 0.8 * as_motion.evidence
+    assert "camera_moved" not in codes(calibration.quality)
+
+
+@pytest.mark.parametrize(
+    ("share", "sigmas", "constant", "said"),
+    [
+        (0.05, 3.5, 0.2, True),
+        (0.05, 3.5, 0.8, False),
+        (0.025, 3.5, 0.2, False),
+        (0.025, 4.5, 0.8, True),
+        (0.05, 2.5, 0.2, False),
+    ],
+)
+def test_a_large_error_of_a_focal_length_needs_less_evidence(share: float, sigmas: float, constant: float, said: bool):
+    given, deviation = torch.full((3,), 1200.0), 1200 * torch.tensor([0.0, share, 0.0])
+    focal = CameraParameter(
+        *("focal length", "px", ("focal",), False), given, given, given, 0.1 * given,
+        (given + deviation, torch.full((3,), 1200 * share / sigmas)),
+    )  # fmt: skip
+    evidence = SimpleNamespace(
+        observations=session(cameras=3, frames=2).observations,
+        constant_errors_sigmas=constant,
+        camera=lambda camera: f"cam{camera}",
+        explains_most=lambda family: True,
+    )
+    found = list(_contradicted(cast(Evidence, evidence), all_unknowns()["focal"], focal))
+    assert [(finding.code, finding.severity) for finding in found] == said * [("focal_contradicted", Severity.SERIOUS)]
+
+
+@pytest.mark.parametrize(("share", "severity"), [(0.7, None), (0.55, Severity.CAUTION), (0.3, Severity.SERIOUS)])
+def test_recordings_with_little_in_common_are_doubted_after_a_search(share: float, severity: Severity | None):
+    evidence = SimpleNamespace(in_common=torch.tensor([0.9, share]), clocks=object(), camera=lambda camera: f"cam{camera}")
+    found = [finding.severity for finding in _little_in_common(cast(Evidence, evidence))]
+    assert found == ([] if severity is None else [severity])
+    assert not list(_little_in_common(cast(Evidence, SimpleNamespace(**vars(evidence) | {"clocks": None}))))
+
+
+def test_a_camera_without_which_no_stick_is_seen_cannot_be_tried():
+    observations = session(cameras=3, frames=20).observations
+    keypoints = observations.keypoints.clone()
+    keypoints[2, :, -2:] = torch.nan
+    evidence = evidence_of(calibrate(replace(observations, keypoints=keypoints)))
+    assert without(evidence, 0) is None
+    assert without(evidence, 2) is not None
+
+
+def test_what_explains_something_serious_comes_first():
+    effect, note = Finding("effect", Severity.FATAL, "."), Finding("note", Severity.NOTE, ".", is_cause=True)
+    small = Finding("small", Severity.CAUTION, ".", is_cause=True)
+    large = Finding("large", Severity.SERIOUS, ".", is_cause=True)
+    assert codes(Quality.of([note, effect, small])) == ["small", "effect", "note"]
+    assert codes(Quality.of([small, effect, large])) == ["large", "effect", "small"]
+    assert codes(Quality.of([note, small, Finding("caution", Severity.CAUTION, ".")]))[0] == "small"
+
+
+def test_every_keypoint_is_used_or_set_aside():
+    given = session(cameras=3, frames=40)
+    keypoints = given.observations.keypoints.clone()
+    keypoints[0, ::3, 4:8] = torch.nan
+    keypoints[1, ::2, 4:8] = torch.nan
+    observations = replace(given.observations, keypoints=keypoints)
+    calibration = calibrate(observations)
+    kinds = ("keypoints_unused", "keypoints_rejected")
+    counts = [int(f.meaning.split(" ")[0]) for f in calibration.quality.findings if f.code in kinds]
+    others = int((observations.visible & calibration.other_person[..., None]).sum())
+    assert len(counts) == 2
+    assert sum(counts) + others == int(observations.visible.sum() - calibration.inliers.sum())
 
 
 def test_another_recording_in_one_camera_is_named():

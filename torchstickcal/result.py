@@ -158,7 +158,7 @@ class Calibration:
     residuals_px: Tensor
     """(C, F, P, 2), projection minus keypoint, pixels, of inliers and outliers; NaN where not seen or the point is not known"""
     inliers: Tensor
-    """(C, F, P), True where a keypoint was used to the end: a second camera sees the point too, and it was not rejected"""
+    """(C, F, P), True where a keypoint was used to the end: a second camera sees the point too, and they agree"""
     stick_lengths_m: Tensor
     """(G, S), reconstructed lengths; NaN where an end is not known"""
     sigma_px: Tensor

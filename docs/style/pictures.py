@@ -1,6 +1,7 @@
 """Makes the pictures of README and documents again: `python docs/style/pictures.py`, or with a folder to put them elsewhere.
 
-Needs Chromium. The report is that of `torchstickcal demo`; the terminal is the sample recording at 80 columns.
+Needs Chromium. The report is that of `torchstickcal demo`; the terminal is the sample recording at 80 columns, and TensorBoard
+shows its calibration.
 """
 
 from __future__ import annotations
@@ -9,9 +10,13 @@ import html
 import os
 import pty
 import re
+import socket
 import subprocess
 import sys
 import tempfile
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 from PIL import Image  # of matplotlib
@@ -26,6 +31,8 @@ from torchstickcal.show.look import COLOURS  # noqa: E402
 _SGR = {"32": COLOURS["good"].dark, "33": COLOURS["usable"].dark, "31": COLOURS["poor"].dark, "1;31": COLOURS["failed"].dark}
 _SAMPLE = "calibrate sample --skeleton sample/skeleton.toml --stick club_grip club_head 1.0 --out results"
 _COLUMNS = 80
+_TENSORBOARD_SIZE, _TENSORBOARD_S = (1280, 900), 20.0
+"""Of its window, and how long it may take until all curves are drawn."""
 _HEIGHT = 3000
 """Of the window: the bar with the slider is where it is when one has scrolled to its end."""
 _MARGIN = 8
@@ -47,6 +54,13 @@ def main(out: Path) -> None:
             _report(page, folder, out)
             page.open(folder / "terminal.html", width=760)
             _take(page, "pre", folder, out / "terminal.png")
+            _run(folder, *_SAMPLE.split(), "--tensorboard", "runs")
+            with _tensorboard(folder / "runs") as address:
+                page.call("Emulation.setEmulatedMedia", features=[{"name": "prefers-color-scheme", "value": "light"}])
+                page.open(f"{address}/#custom_scalars", *_TENSORBOARD_SIZE)
+                time.sleep(_TENSORBOARD_S)
+                page.screenshot(folder / "picture.png")
+                _small(folder / "picture.png", out / "tensorboard.png")
 
 
 def _report(page: Page, folder: Path, out: Path) -> None:
@@ -65,6 +79,26 @@ def _report(page: Page, folder: Path, out: Path) -> None:
                 "report-phone": "#scene",
             }
             _take(page, places[name], folder, out / f"{name}.png")
+
+
+@contextmanager
+def _tensorboard(runs: Path) -> Iterator[str]:
+    """The address of a TensorBoard, which ends with the block."""
+    with socket.socket() as probe:
+        probe.bind(("localhost", 0))
+        port = probe.getsockname()[1]
+    command = [sys.executable, "-m", "tensorboard.main", "--logdir", runs.name, "--port", str(port)]
+    server = subprocess.Popen(command, cwd=runs.parent, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    try:
+        for _ in range(300):
+            with socket.socket() as probe:
+                if probe.connect_ex(("localhost", port)) == 0:
+                    break
+            time.sleep(0.1)
+        yield f"http://localhost:{port}"
+    finally:
+        server.terminate()
+        server.wait()
 
 
 def _take(page: Page, places: str, folder: Path, out: Path) -> None:

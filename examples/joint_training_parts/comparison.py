@@ -38,12 +38,13 @@ def compare(
         watch: what sees each step of a training end to end.
     """
     default, given = CalibrationLayer(stick), layer_of_given_noise(stick, sigma_px)
-    heads = {method: Head(training) for method in ("labels", "reprojections", "end to end", "labels, then end to end")}
+    heads = {method: Head(training) for method in ("labels", "reprojections", "end to end", "labels and end to end")}
     learn_likelihood(heads["labels"], training, training.labels, sigma_px)
     learn_likelihood(heads["reprojections"], training, reprojections(training), sigma_px)
-    heads["labels, then end to end"].load_state_dict(heads["labels"].state_dict())
-    for method in ("end to end", "labels, then end to end"):
-        learn_end_to_end(heads[method], training, given, steps, seed, partial(watch, method) if watch else None)
+    heads["labels and end to end"].load_state_dict(heads["labels"].state_dict())
+    for method, labels_sigma_px in (("end to end", None), ("labels and end to end", sigma_px)):
+        seen_by = partial(watch, method) if watch else None
+        learn_end_to_end(heads[method], training, given, steps, seed, seen_by, labels_sigma_px)
 
     def errors(layer: CalibrationLayer, confidence: Tensor | None) -> Tensor:
         result = layer(test.keypoints, test.intrinsics, test.stick_m, confidence)

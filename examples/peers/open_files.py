@@ -116,7 +116,7 @@ def points(folder: Path) -> None:
     known = file["data"]["meta_points"]["residuals"][0] >= 0
     print(
         f"ezc3d: {len(point['LABELS']['value'])} points, {known.shape[1]} frames at {point['RATE']['value'][0]:g} Hz in "
-        f"{point['UNITS']['value'][0]}, {known.mean():.0%} known, z up to {file['data']['points'][2][known].max():.0f}"
+        f"{point['UNITS']['value'][0]}, {100 * known.mean():.0f} % known, z up to {file['data']['points'][2][known].max():.0f}"
     )
 
 

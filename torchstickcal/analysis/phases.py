@@ -95,18 +95,18 @@ SPORTS: dict[str, Sport] = {
     "golf": Sport("the club's head is nearest to where it was at the takeaway, where the ball lies", _through_address),
     "baseball": Sport("the end of the bat is fastest", _fastest, takeaway=0.30),
     "hockey": Sport("the blade is lowest", _lowest_point, needs_up=True),
-    "kendo": Sport(f"the cut is stopped: the shinai turns at {STOPPED:.0%} of its largest rate", _stopped),
+    "kendo": Sport(f"the cut is stopped: the shinai turns at {100 * STOPPED:.0f} % of its largest rate", _stopped),
 }
 """The rules for the impact by sport."""
 
 RULES = {
-    "swing": f"around each peak of the stick's turn rate of at least {SAME_ACTION:.0%} of the largest one, if no higher "
-    f"peak is within {APART_S:g} s",
+    "swing": f"around each peak of the stick's turn rate of at least {100 * SAME_ACTION:.0f} % of the largest one, if no "
+    f"higher peak is within {APART_S:g} s",
     "takeaway": "the last time before the backswing at which the stick turned at less than 20 % of the largest rate "
     "in it (baseball, where a bat moves little before the swing: 30 %)",
-    "top": f"the last time before the peak at which the stick turned at less than {ONSET:.0%} of the peak's rate; if it never "
-    "did since the backswing, the moment at which it turned slowest",
-    "finish": f"the first time after the peak at which the stick turns at less than {ENDED:.0%} of the peak's rate",
+    "top": f"the last time before the peak at which the stick turned at less than {100 * ONSET:.0f} % of the peak's rate; if "
+    "it never did since the backswing, the moment at which it turned slowest",
+    "finish": f"the first time after the peak at which the stick turns at less than {100 * ENDED:.0f} % of the peak's rate",
 }
 """The rules for the other events, the same for all sports."""
 

@@ -124,7 +124,7 @@ def success(rows: Sequence[Row], label: str, key: Callable[[Row], str]) -> Table
         of = [row for row in bounded if row.method == name]
         if of:
             shares = [mean(float(succeeds(row)) for row in of if key(row) == group) for group in groups]
-            cells.append((method.title, *(None if share is None else f"{share:.0%}" for share in shares)))
+            cells.append((method.title, *(None if share is None else f"{100 * share:.0f} %" for share in shares)))
     note = (
         f"Share of the sessions in which rotation and translation error are at most {SUCCESS_BOUNDS:g} times the Cramér-Rao "
         "bound."

@@ -114,7 +114,7 @@ def _table(found: dict[str, Any]) -> str:
     for pair in sorted(found["pairs"], key=lambda pair: -pair["keypoints"]):
         remark = "" if pair["keypoints"] >= _FEW else "too few to place one by the other"
         rows.append([" - ".join(map(printable, pair["cameras"])), str(pair["keypoints"]), remark])
-    text += [text_table(rows), "", f"{found['triangulated']:.0%} of the points are seen by two cameras or more."]
+    text += [text_table(rows), "", f"{100 * found['triangulated']:.0f} % of the points are seen by two cameras or more."]
     for stick in found["sticks"]:
         ends = f"{printable(stick['start'])} - {printable(stick['end'])}"
         text.append(f"Stick {ends}, {stick['length_m']:g} m: both ends are seen by two cameras in {stick['frames']} frames.")

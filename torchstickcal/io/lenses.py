@@ -49,7 +49,7 @@ class Lenses:
                 raise CalibrationError(
                     "keypoints lie outside the image",
                     where=f"camera {labels[camera]}",
-                    got=f"{outside.mean():.0%} of them, up to x {seen[:, 0].max():.0f} and y {seen[:, 1].max():.0f}",
+                    got=f"{100 * outside.mean():.0f} % of them, up to x {seen[:, 0].max():.0f} and y {seen[:, 1].max():.0f}",
                     expected=f"an image of {size[0]:g} x {size[1]:g} pixels",
                     remedy="If the images were made smaller or larger after the calibration, give their size (--image-size).",
                 )

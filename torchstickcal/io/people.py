@@ -120,7 +120,7 @@ def _said(views: Sequence[View], chosen: Sequence[Rows], how: str, lead: float, 
     seen = ", ".join(
         f"{view.name} {len(rows)} of {len(np.unique(view.frames))}" for view, rows in zip(views, chosen, strict=True)
     )
-    known = "" if share is None else f" In {share:.0%} of the frames, the cameras agree on who it is."
+    known = "" if share is None else f" In {100 * share:.0f} % of the frames, the cameras agree on who it is."
     said = (
         f"Several people are in view. The athlete is taken to be the one {_WHO[how]}; frames with the athlete: {seen}.{known}"
     )

@@ -14,6 +14,8 @@ from torchstickcal.model.measurements import Measurements
 from torchstickcal.model.state import State
 from torchstickcal.pipeline.adjust import WarmStart
 from torchstickcal.pipeline.relabel import Labels
+from torchstickcal.quality.finding import Finding, Severity
+from torchstickcal.quality.verdict import Acceptance, LengthErrors, Quality, Verdict
 
 
 @dataclass(frozen=True)
@@ -66,9 +68,17 @@ class LayerResult:
     sigma_px: Tensor
     """(B, P), estimated noise of each point's keypoints, pixels"""
     converged: Tensor
-    """(B,); the gradients of a session that could not be calibrated are zero"""
+    """(B,); the gradients of a session that has not converged are zero"""
     status: tuple[str, ...]
     """``converged``, or why not, for each session"""
+    verdict: Tensor | None = None
+    """(B,), whether the result can be used: 0 good, 1 usable, 2 poor, 3 failed; None unless the layer judges, as in the next"""
+    agreement: Tensor | None = None
+    """(B, C), share of each camera's keypoints that agree with the other cameras"""
+    metre_m: Tensor | None = None
+    """(B,), half the width of the 95 % interval of a length of 1 m, metres; NaN where that cannot be said"""
+    qualities: tuple[Quality, ...] | None = None
+    """the verdict on each session with its reasons, as :attr:`torchstickcal.Calibration.quality`"""
 
     @staticmethod
     def of(
@@ -112,10 +122,29 @@ class LayerResult:
         )
 
     @staticmethod
-    def of_tensors(tensors: Mapping[str, Any], status: Sequence[str]) -> LayerResult:
-        """A result of what :meth:`tensors` gives, and the status of each session."""
+    def of_tensors(
+        tensors: Mapping[str, Any], status: Sequence[str], qualities: tuple[Quality, ...] | None = None
+    ) -> LayerResult:
+        """A result of what :meth:`tensors` gives, and the status and the quality of each session."""
         every: dict[str, Any] = dict.fromkeys(_TENSORS)
-        return LayerResult(**every | dict(tensors), status=tuple(status))
+        return LayerResult(**every | dict(tensors), status=tuple(status), qualities=qualities)
+
+    def with_qualities(self, qualities: Sequence[Quality], agreement: Tensor) -> LayerResult:
+        """The result with the quality of each session.
+
+        Args:
+            qualities: of each session.
+            agreement: (B, C), share of each camera's keypoints that agree with the other cameras.
+        """
+        dtype, device = self.rotations.dtype, self.rotations.device
+        metres = [torch.nan if one.acceptance is None else one.acceptance.metre_m for one in qualities]
+        return replace(
+            self,
+            verdict=torch.tensor([list(Verdict).index(one.verdict) for one in qualities], device=device),
+            agreement=agreement.to(device=device, dtype=dtype),
+            metre_m=torch.tensor(metres, device=device, dtype=dtype),
+            qualities=tuple(qualities),
+        )
 
     def each(self, function: Callable[[Tensor], Tensor]) -> LayerResult:
         """A result made of this one, tensor by tensor."""
@@ -149,9 +178,11 @@ class LayerResult:
         """One session of a batch, without the leading B, or several."""
         self._check_batched()
         numbers = range(len(self))[chosen]  # raises an IndexError for a session that does not exist
-        said = (self.status[numbers],) if isinstance(numbers, int) else tuple(self.status[number] for number in numbers)
-        place = numbers if isinstance(numbers, int) else list(numbers)
-        return replace(self.each(lambda tensor: tensor[place]), status=said)
+        every = [numbers] if isinstance(numbers, int) else list(numbers)
+        place = every[0] if isinstance(numbers, int) else every
+        said = tuple(self.status[number] for number in every)
+        qualities = None if self.qualities is None else tuple(self.qualities[number] for number in every)
+        return replace(self.each(lambda tensor: tensor[place]), status=said, qualities=qualities)
 
     def __iter__(self) -> Iterator[LayerResult]:
         """The sessions of a batch."""
@@ -197,16 +228,21 @@ class LayerResult:
             return None if tensors[0] is None else torch.cat(tensors)[order]
 
         tensors: dict[str, Any] = {name: joined(name) for name in _TENSORS}
-        return LayerResult(**tensors, status=tuple(status[place] for place in order))
+        qualities = [one for result in results for one in result.qualities or ()]
+        return LayerResult(
+            **tensors,
+            status=tuple(status[place] for place in order),
+            qualities=tuple(qualities[place] for place in order) if len(qualities) == len(status) > 0 else None,
+        )
 
 
-_TENSORS = [field.name for field in fields(LayerResult) if field.name != "status"]
+_TENSORS = [field.name for field in fields(LayerResult) if field.name not in ("status", "qualities")]
 
 
 def _flattened(result: LayerResult) -> tuple[list[Any], Any]:
     """The tensors of a result for torch's pytrees, and the rest."""
     tensors = result.tensors()
-    return list(tensors.values()), (tuple(tensors), result.status)
+    return list(tensors.values()), (tuple(tensors), result.status, result.qualities)
 
 
 def _flattened_with_names(result: LayerResult) -> tuple[list[tuple[Any, Any]], Any]:
@@ -217,8 +253,8 @@ def _flattened_with_names(result: LayerResult) -> tuple[list[tuple[Any, Any]], A
 
 def _unflattened(values: Any, rest: Any) -> LayerResult:
     """A result of tensors, or of whatever a function has put in their places."""
-    names, status = rest
-    return LayerResult.of_tensors(dict(zip(names, values, strict=True)), status)
+    names, status, qualities = rest
+    return LayerResult.of_tensors(dict(zip(names, values, strict=True)), status, qualities)
 
 
 pytree.register_pytree_node(
@@ -228,4 +264,4 @@ pytree.register_pytree_node(
     serialized_type_name="torchstickcal.LayerResult",
     flatten_with_keys_fn=_flattened_with_names,
 )
-torch.serialization.add_safe_globals([LayerResult])
+torch.serialization.add_safe_globals([LayerResult, Quality, Finding, Severity, Acceptance, LengthErrors])

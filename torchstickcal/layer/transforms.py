@@ -20,6 +20,7 @@ from torch.utils import _pytree as pytree
 from torchstickcal.errors import CalibrationError
 from torchstickcal.layer.inputs import LayerInputs
 from torchstickcal.layer.result import LayerResult
+from torchstickcal.quality.verdict import Quality
 
 _Arguments = ParamSpec("_Arguments")
 _Result = TypeVar("_Result")
@@ -43,7 +44,7 @@ def calibrated_in_any_transform(calibrated: Callable[[LayerInputs], LayerResult]
     if torch._C._are_functorch_transforms_active() or any(map(_is_dual, tensors.values())):
         call = _Call(calibrated, given)
         found = _Calibrated.apply(call, *tensors.values())
-        return LayerResult.of_tensors(dict(zip(call.outputs, found, strict=True)), call.status)
+        return LayerResult.of_tensors(dict(zip(call.outputs, found, strict=True)), call.status, call.qualities)
     return calibrated(given.with_tensors({name: _Once.apply(tensor) for name, tensor in tensors.items()}))
 
 
@@ -84,6 +85,7 @@ class _Call:
         self._calibrated, self._given, self._names = calibrated, given, tuple(given.tensors())
         self.outputs: dict[str, Tensor] = {}
         self.status: tuple[str, ...] = ()
+        self.qualities: tuple[Quality, ...] | None = None
         self._leaves: list[Tensor] = []
 
     def run(self, tensors: Sequence[Tensor]) -> tuple[Tensor, ...]:
@@ -91,7 +93,7 @@ class _Call:
         self._leaves = [tensor.detach().requires_grad_() for tensor in tensors]
         with torch.enable_grad():
             result = self._calibrated(self._given.with_tensors(dict(zip(self._names, self._leaves, strict=True))))
-        self.outputs, self.status = result.tensors(), result.status
+        self.outputs, self.status, self.qualities = result.tensors(), result.status, result.qualities
         return tuple(tensor.detach() for tensor in self.outputs.values())
 
     def gradients(self, by_outputs: Sequence[Tensor]) -> tuple[Tensor, ...]:

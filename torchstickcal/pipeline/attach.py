@@ -21,8 +21,8 @@ from torchstickcal.solvers.newton import minimum_near
 def attach_gradients(ended: Adjustment, data: Measurements, run: Run, mode: GradientMode) -> State:
     """The state where the last stage ended, with gradients.
 
-    It depends on the measurements through the last stage that estimated cameras and through those after it. Sessions in which
-    a stage has failed have no gradients.
+    It depends on the measurements through the last stage that estimated cameras and through those after it. Sessions that have
+    not converged have no gradients: these are defined at a minimum only, and elsewhere may be of any size.
 
     Args:
         ended: the sessions where their last stage ended.
@@ -41,8 +41,8 @@ def attach_gradients(ended: Adjustment, data: Measurements, run: Run, mode: Grad
             kept = replace(data, confidence=data.confidence.where(result.inliers, 0.0))
             factors, _ = scale_factors(kept, state.points, rulers(kept, run.config))
             state = state.scaled(factors)
-    failed = torch.tensor([any(record.stop.failed for record in records) for records in ended.records])
-    return state.replaced(failed.to(state.points.device), ended.state)
+    elsewhere = torch.tensor([not all(record.stop.converged for record in records) for records in ended.records])
+    return state.replaced(elsewhere.to(state.points.device), ended.state)
 
 
 def _levels(held: HeldNoise, result: StageResult, data: Measurements, before: State | None) -> NoiseLevels | None:

@@ -48,13 +48,9 @@ def conclude(
     inliers, sigma_px = measurements.by_frame(ended.last.inliers[0]), ended.last.sigma_px[0]
     points = measurements.by_frame(ended.state.points[0]).where(inliers.any(0), torch.nan).movedim(0, -1)
     cameras = measurements.cameras_at(ended.state).to(torch.float64)[0]
-    noise, ruler = _covariances(ended, run.config)
-    covariance = noise + ruler
+    evidence = evidence_of(ended, check, run.config, clocks, unsynchronised, left_out, start_contradicted)
+    covariance, unknowns = evidence.noise + evidence.ruler, evidence.unknowns
     tangents = 6 * (measurements.num_cameras - 1)
-    unknowns = _unknowns(ended, check, covariance[tangents:, tangents:])
-    evidence = Evidence(
-        ended, unknowns, noise, ruler, clocks, unsynchronised, left_out, run.config, start_contradicted=start_contradicted
-    )
     ends = torch.tensor([stick.ends for stick in observations.sticks], dtype=torch.long).view(-1, 2)
     size, count = observations.image_size, observations.num_cameras
     distortion = cameras.distortion if ended.refined else observations.distortion
@@ -90,6 +86,22 @@ def conclude(
         judgement=partial(judged, evidence),
         left_out=left_out,
     )
+
+
+def evidence_of(
+    ended: Adjustment,
+    check: CameraCheck,
+    config: Config,
+    clocks: ClockEstimate | None = None,
+    unsynchronised: Callable[[], bool] = lambda: False,
+    left_out: tuple[str, ...] = (),
+    start_contradicted: bool = False,
+) -> Evidence:
+    """What the quality of one session is judged by; arguments as of :func:`conclude`."""
+    noise, ruler = _covariances(ended, config)
+    tangents = 6 * (ended.measurements.num_cameras - 1)
+    unknowns = _unknowns(ended, check, (noise + ruler)[tangents:, tangents:])
+    return Evidence(ended, unknowns, noise, ruler, clocks, unsynchronised, left_out, config, start_contradicted)
 
 
 def keypoint_index(ended: Adjustment) -> Tensor:

@@ -19,12 +19,14 @@ class Run:
         seconds: time by step, which the steps add to.
         to_rounding: whether the last camera stage and those after it are taken to their minima up to rounding errors, for
             gradients. Their solver then only has to come near.
+        must_converge: whether a stage that does not converge ends everything with an error, because nothing else is of use.
     """
 
     config: Config
     listener: Listener = ignore_record
     seconds: dict[str, float] = field(default_factory=dict)
     to_rounding: bool = False
+    must_converge: bool = False
 
     @property
     def camera_stages(self) -> dict[str, Stage]:

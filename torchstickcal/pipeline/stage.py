@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from torchstickcal.config import Stage
+from torchstickcal.errors import CalibrationError
 from torchstickcal.losses import Loss
 from torchstickcal.model.measurements import Measurements
 from torchstickcal.model.noise import NEAR_SIGMAS, near_keypoints
@@ -100,6 +101,9 @@ def run_stage(
         state: where it starts.
         run: what all steps share.
         roughly: whether it is enough to come near the minimum.
+
+    Raises:
+        CalibrationError: if it does not converge in a session, and the run must.
     """
     began, given = time.perf_counter(), measurements
     if stage.cameras == "free" and not stage.rescale:
@@ -135,6 +139,8 @@ def run_stage(
     run.took(name, seconds)
     ended = zip(stops, outcome.iterations, strict=True)
     records = tuple(StageRecord(name, stop, seconds, iterations) for stop, iterations in ended)
+    if run.must_converge and (failed := [stop for stop in stops if not stop.converged]):
+        raise CalibrationError("a stage did not converge", where=name, got=str(failed[0]), expected="convergence")
     inliers = measurements.visible
     return StageResult(stage, state, minimum, losses, inliers, levels, gates, records)
 

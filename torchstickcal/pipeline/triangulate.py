@@ -58,7 +58,7 @@ def triangulate(
 ) -> Reconstruction:
     """Find the points of a recording, in metres, with cameras that were calibrated before and have not been moved since.
 
-    Keypoints that contradict the other cameras are rejected, label errors are undone, time offsets are found where the cameras
+    Keypoints that contradict the other cameras are set aside, label errors are undone, time offsets are found where the cameras
     do not run together, and trajectories are smoothed, as by :func:`torchstickcal.calibrate`. The lengths of sticks are not
     used. So they are an independent check of the calibration.
 

@@ -199,7 +199,7 @@ def _checked(old: OldRig, observations: Observations) -> Quality:
             Finding(
                 "camera_contradicts",
                 Severity.FATAL,
-                f"{name}: only {share:.0%} of its keypoints agree with the calibration, wherever it is.",
+                f"{name}: only {100 * share:.0f} % of its keypoints agree with the calibration, wherever it is.",
                 "Check that the recording is of the same cameras in the same order, and that all show the same athlete at the "
                 "same time.",
                 cameras=(name,),

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -27,9 +27,20 @@ from torchstickcal.solvers.uncertainty import centre_covariances, relative_scale
 _CONSISTENT_SHARE, _BEHIND_OTHERS, _NOISY_MRAD = 0.62, 0.85, 10.0
 """Least share of a camera's keypoints that agree, also over that of the median camera, and noise of the keypoints, of a rig
 whose cameras see one scene. Sound cameras keep 84 % and more, with 20 % of wrong keypoints 66 %."""
+DOUBTFUL_SHARE = 0.78
+"""Share of a camera's keypoints that agree, below which it is doubted where the other cameras have more."""
 _NEAR_FOCAL = 0.3
 """Logarithm of an estimated or suggested over the given focal length: from here on, something else is wrong."""
 _FAR_SIGMAS = 8.0
+_MOST_SHARE, _MOST_PLACES, _OUTSIDE = (0.05, 0.95), 20_000, 1.2
+"""Quantiles of the keypoints between which the rest are wrong ones, the number of keypoints that is looked at, and the distance
+from the principal point, over its own from the corner of the image, beyond which there is no image."""
+_SAID_BY_IMAGES = 2.0
+"""Factor of the evidence against the clocks where the motion in the images, by itself, speaks against them too."""
+CONSTANT_SIGMAS = 0.5
+"""Errors that are always the same, over the noise, from which on they matter."""
+_LEAST_FRAMES = 20
+"""Frames of a point in a camera from which on it can be told which part of its errors is always the same."""
 _OTHER_PERSON_SHARE = 0.2
 """Share of a camera's frames that were set aside as those of another person, from which on the camera itself is doubted."""
 
@@ -104,9 +115,23 @@ class Evidence:
 
     @cached_property
     def agreement(self) -> Tensor:
-        """(C,), share of each camera's keypoints that agree with the other cameras; 1 where it has none."""
-        seen, kept = (m.visible[0].sum(-1).double() for m in (self.measurements, self.kept))
+        """(C,), share of each camera's keypoints that agree with the other cameras; 1 where it has none. Those at exactly
+        (0, 0), with which some detectors mark missing ones, do not count."""
+        at_corner = (self.ended.seen.pixels[0] == 0).all(1)
+        seen, kept = ((m.visible[0] & ~at_corner).sum(-1).double() for m in (self.measurements, self.kept))
         return (kept / seen.clamp_min(1)).where(seen > 0, 1.0)
+
+    @cached_property
+    def doubtful(self) -> Tensor:
+        """(C,), whether clearly fewer keypoints of a camera agree than of the others."""
+        return (self.agreement < DOUBTFUL_SHARE) & (self.agreement < _BEHIND_OTHERS * self.agreement.median())
+
+    @cached_property
+    def in_common(self) -> Tensor:
+        """(C,), share of each camera's keypoints that another camera sees at the same time; 1 where it has none. Of a camera
+        that has more than others, as many count."""
+        seen, compared = self.observations.visible.flatten(1).sum(1).double(), self.measurements.visible[0].sum(-1)
+        return (compared / seen.minimum(seen.median()).clamp_min(1)).clamp_max(1.0).where(seen > 0, 1.0)
 
     @cached_property
     def consistent(self) -> bool:
@@ -125,6 +150,22 @@ class Evidence:
         far = (wanted / focal.given).clamp_min(1e-3).log().abs() > _NEAR_FOCAL
         known = self.observations.intrinsics_known
         return far & (self.contradictions["focal"] > _FAR_SIGMAS**2) if known else torch.zeros_like(far)
+
+    @cached_property
+    def off_centre(self) -> Tensor:
+        """(C,), whether a camera's keypoints lie where the images of its intrinsics do not: all of them above and to the left
+        of the principal point, or many far outside. So they do where the intrinsics are those of another resolution."""
+        observations = self.observations
+        centre = observations.cameras.matrix[:, :2, 2].double()
+        found = torch.zeros(self.cameras, dtype=torch.bool, device=centre.device)
+        for camera in range(self.cameras if observations.intrinsics_known else 0):
+            seen = observations.keypoints[camera][observations.visible[camera]].double()
+            if len(seen):
+                places = seen[:: 1 + len(seen) // _MOST_PLACES] / centre[camera] - 1
+                low, high = places.quantile(_MOST_SHARE[0], dim=0), places.quantile(_MOST_SHARE[1], dim=0)
+                outside = observations.image_size is None and bool((low.abs().maximum(high.abs()) > _OUTSIDE).any())
+                found[camera] = bool((high < 0).all()) or outside
+        return found
 
     @cached_property
     def centres(self) -> Tensor:
@@ -165,11 +206,30 @@ class Evidence:
         return self.measurements.by_frame(self.state.points[0].where(known, torch.nan))
 
     @cached_property
+    def constant_errors_px(self) -> Tensor:
+        """(C, 2, P), mean residual of each point in each camera, pixels; 0 where it is seen in too few frames to tell."""
+        m = self.kept
+        sums = torch.zeros(self.cameras, 2, m.points_per_frame, dtype=torch.float64, device=m.pixels.device)
+        for columns, found, _ in m.residuals(self.state):
+            seen = m.visible[0][:, None, columns]
+            sums += found[0].double().where(seen, 0.0).unflatten(-1, (-1, m.points_per_frame)).sum(-2)
+        count = m.by_frame(m.visible[0]).sum(1)[:, None]
+        return (sums / count.clamp_min(1)).where(count >= _LEAST_FRAMES, 0.0)
+
+    @cached_property
+    def constant_errors_sigmas(self) -> float:
+        """Root mean square of the errors that are always the same, over the noise; 0 where that cannot be told."""
+        told = self.constant_errors_px != 0
+        return float((self.constant_errors_px / self.sigma_px)[told].square().mean().sqrt()) if bool(told.any()) else 0.0
+
+    @cached_property
     def motion(self) -> Motion | None:
         """The most evident change of a camera's pose during the session; None where nothing can be said."""
         if self.cameras < 2 or not bool(self.kept.active.any()):
             return None
-        pulls = FramePulls.of(self.measurements, self.state, self.ended.last.sigma_px)
+        m = self.measurements
+        varying = replace(m, pixels=m.pixels + self.constant_errors_px.to(m.pixels).repeat(1, 1, m.frames))
+        pulls = FramePulls.of(varying, self.state, self.ended.last.sigma_px)
         return motion_of(pulls, self.state.rotations[0], self.state.translations[0])
 
     @cached_property
@@ -194,6 +254,8 @@ class Evidence:
             family = all_unknowns()[unknown].family
             if not self.unknowns[unknown].refined:
                 strengths[family] = max(strengths[family], float(squared.max()))
+        if self.unsynchronised():
+            strengths["clock"] *= _SAID_BY_IMAGES
         return strengths[name] >= max(strengths.values())
 
     @cached_property

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import torch
 
 from torchstickcal.quality.evidence import Evidence
@@ -10,6 +12,10 @@ from torchstickcal.quality.registry import FAMILIES, Family
 from torchstickcal.quality.verdict import Acceptance, Quality
 from torchstickcal.workers import on_worker
 
+_NOISY_MRAD = 5.0
+"""Noise of the keypoints above which causes are tried even where another was found: good detectors have 1 to 4. So they are
+where several things are wrong, which may have one cause."""
+
 
 def judged(evidence: Evidence) -> Quality:
     """The findings on a session, and the acceptance test. Causes are tried only where something is wrong."""
@@ -17,19 +23,33 @@ def judged(evidence: Evidence) -> Quality:
 
 
 def _judged(evidence: Evidence) -> Quality:
-    first = [family for family in FAMILIES.values() if not family.tries]
-    found = {family: _findings(family, evidence) for family in first}
-    every = [finding for own in found.values() for finding in own]
-    wrong = any(finding.severity >= Severity.SERIOUS for finding in every)
-    large = any(finding.is_cause for family, own in found.items() if not family.small for finding in own)
-    explained = large or (evidence.consistent and any(finding.is_cause for finding in every))
-    doubtful = any(finding.code == "camera_doubtful" for finding in every)
-    if (wrong or doubtful) and not explained:
+    found = {family: _findings(family, evidence) for family in FAMILIES.values() if not family.tries}
+    large = [finding for family, own in found.items() if not family.small for finding in own]
+    small = [finding for family, own in found.items() if family.small for finding in own]
+    if not evidence.consistent and any(finding.is_cause for finding in large):
+        small = [_as_effect(finding) for finding in small]
+    causes: list[Finding] = []
+    if _worth_trying(evidence, found):
         causes = [finding for family in FAMILIES.values() if family.tries for finding in _findings(family, evidence)]
-        if causes:
-            every = [finding for family, own in found.items() if not family.small for finding in own]
-        every += causes
-    return Quality.of(every, _acceptance(evidence))
+    return Quality.of([*causes, *large, *([] if causes else small)], _acceptance(evidence))
+
+
+def _worth_trying(evidence: Evidence, found: dict[Family, list[Finding]]) -> bool:
+    """Whether something is wrong, or may be, that no finding explains."""
+    if bool(evidence.off_centre.any()):
+        return True
+    every = [finding for own in found.values() for finding in own]
+    wrong = any(finding.severity >= Severity.SERIOUS or finding.code == "camera_doubtful" for finding in every)
+    explaining = [family for family, own in found.items() if any(finding.is_cause for finding in own)]
+    serious = [family for family, own in found.items() if any(finding.severity >= Severity.SERIOUS for finding in own)]
+    alone = len(serious) < 2 and evidence.noise_mrad < _NOISY_MRAD
+    explained = any(family.direct or (alone and (evidence.consistent or not family.small)) for family in explaining)
+    return wrong and not explained
+
+
+def _as_effect(finding: Finding) -> Finding:
+    """A small error beside a large one, among cameras that do not agree: it may be nothing but an effect of the large one."""
+    return replace(finding, is_cause=False)
 
 
 def _findings(family: Family, evidence: Evidence) -> list[Finding]:

@@ -27,6 +27,8 @@ _EDGE = 0.04
 """Share of a session at each end in which no change is looked for: too few frames speak for it."""
 _BLOCKS = (12, 24, 48)
 """Numbers of blocks of frames from whose scatter the variance is estimated."""
+_LEAST_VARIANCE = 0.25
+"""Least variance of the pulls, over that of independent errors: of keypoints without noise only rounding errors are left."""
 
 
 class Motion(NamedTuple):
@@ -111,7 +113,7 @@ def _changes(camera: int, gradient: Tensor, information: Tensor, inverse: Tensor
         variance = variance_of_sums(pull - _explained(rows[..., place], ramp, drift[0]), rows[..., place], _BLOCKS)
     strongest = max(float(drift_evidence), float(evidence[best]))
     tangent, part = (drift[0], 0) if gradual else (changes[best], int(steps[best]))
-    return _Change(strongest / variance, part, tangent, gradual)
+    return _Change(strongest / max(variance, _LEAST_VARIANCE), part, tangent, gradual)
 
 
 def _scored(pull: Tensor, own: Tensor, rows: Tensor, inverse: Tensor, prior: Tensor) -> tuple[Tensor, Tensor]:

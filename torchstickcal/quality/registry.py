@@ -23,12 +23,14 @@ class Family:
         look: finds them.
         tries: whether it tries to explain what others found. It is asked only where something is wrong.
         small: whether its findings are small errors, found by linearising. They are not said where a trial finds a larger one.
+        direct: whether its causes follow from what was given, however wrong the result is. They are not tried again.
     """
 
     description: str
     look: Look
     tries: bool = False
     small: bool = False
+    direct: bool = False
 
 
 FAMILIES: Registry[Family] = Registry("family of findings", "torchstickcal.quality.findings")
@@ -36,7 +38,7 @@ FAMILIES: Registry[Family] = Registry("family of findings", "torchstickcal.quali
 
 
 def findings(
-    name: str, description: str, *, tries: bool = False, small: bool = False, replace: bool = False
+    name: str, description: str, *, tries: bool = False, small: bool = False, direct: bool = False, replace: bool = False
 ) -> Callable[[Look], Look]:
     """Register a function that makes findings, as a decorator.
 
@@ -45,6 +47,7 @@ def findings(
         description: one line, for lists.
         tries: whether it tries to explain what others found. It is asked only where the verdict is poor or failed.
         small: whether its findings are small errors, found by linearising. They are not said where a trial finds a larger one.
+        direct: whether its causes follow from what was given, however wrong the result is. They are not tried again.
         replace: whether it may take the place of another of that name.
 
     Raises:
@@ -61,7 +64,7 @@ def findings(
     def register(look: Look) -> Look:
         if not callable(look):
             raise ConfigError("not a function", where=f"findings({name!r})", got=look, expected="a function of an Evidence")
-        FAMILIES.register(name, Family(description, look, tries, small), replace=replace)
+        FAMILIES.register(name, Family(description, look, tries, small, direct), replace=replace)
         return look
 
     return register

@@ -37,6 +37,8 @@ class Resection(NamedTuple):
     """(n,), True where a keypoint agrees with its point"""
     information: Tensor
     """(6, 6), about the tangent of the pose"""
+    distance_sigmas: float
+    """median distance of the keypoints from their points, in noise"""
 
     @property
     def share(self) -> float:
@@ -84,7 +86,7 @@ def resected(
     reach = (AGREEING_SIGMAS * sigma_px).clamp_min(LEAST_REACH * float(camera.focal_px.mean()))
     distance = (camera.project(in_camera.mT[None])[0].mT - pixels).norm(dim=0)
     agreeing = (distance < reach) & (in_camera[2] > 0)
-    return Resection(rotation, translation, agreeing, moments)
+    return Resection(rotation, translation, agreeing, moments, float((distance / sigma_px).median()))
 
 
 def _searched(points: Tensor, pixels: Tensor, sigma_px: Tensor, camera: Intrinsics) -> tuple[Tensor, Tensor] | None:

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from torchstickcal.config import Config
-from torchstickcal.errors import CalibrationError
+from torchstickcal.errors import CalibrationError, ObservationError
 from torchstickcal.geometry.cameras import Intrinsics
 from torchstickcal.observations import Observations
 from torchstickcal.pipeline.adjust import Adjustment, adjust_cameras, begin
@@ -23,6 +23,9 @@ _TRIAL_ITERATIONS = 20
 """Iterations of a stage of a trial at most: one that needs more explains nothing."""
 _SCALES = (1 / 3, 0.5, 2 / 3, 0.75, 4 / 3, 1.5, 2.0, 3.0)
 """Ratios of resolutions that videos are commonly converted by."""
+_LEAST_OF_PLACES, _GAIN_OF_PLACES, _RATIO_OF_PLACES = 0.45, 0.1, 1.25
+"""Share of a camera's keypoints that agree with it at two places, one before and one after some frame: the least, and over that
+at one place."""
 _LARGEST_SHIFT_S = 1.0
 _COARSE_SHIFTS = 12
 
@@ -154,7 +157,10 @@ def without(evidence: Evidence, camera: int) -> Rest | None:
     groups = evidence.config.camera_groups
     config = replace(evidence.config, camera_groups=[groups[other] for other in others] if groups else [])
     observations = evidence.ended.labels.applied(evidence.observations) if _synchronous(evidence) else evidence.observations
-    ended = tried(observations.of_cameras(others), config, evidence.ended.refined)
+    try:
+        ended = tried(observations.of_cameras(others), config, evidence.ended.refined)
+    except ObservationError:  # the others do not see a stick
+        return None
     if ended is None:
         return None
     known = ended.kept.active[0]
@@ -162,13 +168,15 @@ def without(evidence: Evidence, camera: int) -> Rest | None:
     return Rest(ended, points, ended.last.sigma_px[0])
 
 
-def tried(observations: Observations, config: Config, refined: tuple[str, ...]) -> Adjustment | None:
-    """A session adjusted in few iterations without anybody listening; None where its cameras are no rig."""
+def tried(
+    observations: Observations, config: Config, refined: tuple[str, ...], must_converge: bool = False
+) -> Adjustment | None:
+    """A session adjusted in few iterations without anybody listening; None where its cameras are no rig, or do not converge."""
     stages = {
         name: replace(stage, max_iterations=min(stage.max_iterations, _TRIAL_ITERATIONS))
         for name, stage in config.stages.items()
     }
-    run = Run(replace(config, stages=stages))
+    run = Run(replace(config, stages=stages), must_converge=must_converge)
     try:
         return adjust_cameras(begin(observations, run, refined), run)
     except CalibrationError:
@@ -176,12 +184,12 @@ def tried(observations: Observations, config: Config, refined: tuple[str, ...]) 
 
 
 def sight_of(evidence: Evidence, camera: int) -> Sight:
-    """One camera as it was given."""
+    """One camera as it was given, without keypoints at exactly (0, 0)."""
     observations = evidence.observations
     keypoints = observations.keypoints[camera].double()
     size = observations.image_size
     return Sight(
-        keypoints.where(observations.visible[camera][..., None], torch.nan),
+        keypoints.where((observations.visible[camera] & (keypoints != 0).any(-1))[..., None], torch.nan),
         observations.cameras[camera : camera + 1],
         None if size is None else (size if size.ndim == 1 else size[camera]),
     )
@@ -221,7 +229,8 @@ def moved_within(rest: Rest, sight: Sight) -> tuple[int, Resection, Resection] |
     total = usable.sum()
     share = float((agree[0][:frame].sum() + agree[1][frame:].sum()) / total.clamp_min(1))
     single = max(float(one.sum() / total.clamp_min(1)) for one in agree)
-    if not third // 2 < frame < frames - third // 2 or share < 0.65 or share < single + 0.1:
+    least = max(_LEAST_OF_PLACES, single + _GAIN_OF_PLACES, _RATIO_OF_PLACES * single)
+    if not third // 2 < frame < frames - third // 2 or share < least:
         return None
     before, after = rest.placed(sight, slice(0, frame)), rest.placed(sight, slice(frame, frames))
     return None if before is None or after is None else (frame, before[0], after[0])

@@ -126,12 +126,16 @@ class Quality:
     @staticmethod
     def of(findings: Iterable[Finding], acceptance: Acceptance | None = None) -> Quality:
         """The findings in their order: causes of what is serious first, then the most severe."""
+        every = list(findings)
+        worst = max((finding.severity for finding in every), default=Severity.NOTE)
+        causes = max((finding.severity for finding in every if finding.is_cause), default=Severity.NOTE)
+        least = min(Severity.SERIOUS, max(causes, Severity.CAUTION)) if worst >= Severity.SERIOUS else Severity.SERIOUS
 
         def place(finding: Finding) -> tuple[bool, int, bool]:
-            explains = finding.is_cause and finding.severity >= Severity.SERIOUS
+            explains = finding.is_cause and finding.severity >= least
             return not explains, -finding.severity, not finding.is_cause
 
-        return Quality(tuple(sorted(findings, key=place)), acceptance)
+        return Quality(tuple(sorted(every, key=place)), acceptance)
 
     @property
     def verdict(self) -> Verdict:

@@ -29,11 +29,6 @@ class Stop(StrEnum):
         """Whether the state is a minimum within the requested tolerance."""
         return self in {Stop.COST, Stop.CAMERAS, Stop.EXACT}
 
-    @property
-    def failed(self) -> bool:
-        """Whether the state means nothing, however often the solver is run again."""
-        return self in {Stop.UNDETERMINED, Stop.UNSCALED}
-
 
 @dataclass(frozen=True)
 class Termination:

@@ -20,8 +20,8 @@ _MAX_ROUNDS = 40
 _ROUNDING_SIGMAS, _NEAR_SIGMAS = 1e-7, 1e-3
 """Length of a step, in standard deviations of the estimate, below which it is the last: for a minimum up to rounding errors, or
 near enough for everything but gradients, and as near as float32 allows."""
-_CONVERGED_SIGMAS = 1e-2
-"""The same, below which it has converged as far as rounding allows."""
+_FAR_SIGMAS, _FAR_FROM_NEAR_SIGMAS = 1e-4, 1e-2
+"""The same, above which steps that do not become shorter any more say that there is no minimum: rounding errors are smaller."""
 _SLOW, _OLD = 0.3, 3
 """Ratio of the lengths of two steps, and number of steps with one Hessian, from which on it is built anew."""
 
@@ -57,7 +57,8 @@ def minimum_near(
     at, acceleration = Linearised(objective_at(trial), trial, cameras_free), Acceleration()
     objective, gradient, age, age_of_step, back = at.objective, at.gradient, 0, 0, False
     is_double = objective.measurements.pixels.dtype == torch.float64
-    tolerance = _ROUNDING_SIGMAS if to_rounding and is_double else _NEAR_SIGMAS
+    exact = to_rounding and is_double
+    tolerance, far = (_ROUNDING_SIGMAS, _FAR_SIGMAS) if exact else (_NEAR_SIGMAS, _FAR_FROM_NEAR_SIGMAS)
     shortest = torch.full_like(state.points[:, 0, 0], torch.inf)
     moving = torch.ones_like(shortest, dtype=torch.bool)
     for _ in range(_MAX_ROUNDS):
@@ -76,18 +77,17 @@ def minimum_near(
         # A step that has become longer is undone. It is tried again with a new Hessian, unless it had one.
         back = not back and bool((moving & ~shorter).any())
         if back:
-            trial, acceleration = best, Acceleration()
+            trial = best
         else:
             moved, _ = acceleration.step(-step.where(moving).flat(), -gradient.where(moving).flat())
             trial = best.replaced(moving, _moved(best, step.like(moved), 1.0))
         objective, age_of_step = objective_at(trial), age
         if back or (slow and age >= _OLD):
-            at, age = Linearised(objective, trial, cameras_free), 0
+            at, age, acceleration = Linearised(objective, trial, cameras_free), 0, Acceleration()
             gradient = at.gradient
         else:
             gradient, age = gradient_at(objective, trial, cameras_free), age + 1
-    converged = shortest < _CONVERGED_SIGMAS
-    return Linearised(objective_at(best), best, cameras_free), converged
+    return Linearised(objective_at(best), best, cameras_free), shortest < far
 
 
 def _moved(state: State, step: Tangent, factor: float) -> State:

@@ -234,7 +234,7 @@ def _about(found: VideoKeypoints) -> str:
     text += f", {dropped} dropped" if dropped else ""
     for number, name in enumerate(found.points):
         if name.startswith(("tape_", SHAFT_POINTS[-1])):
-            text += f", {name} in {_share_seen(found, number):.0%}"
+            text += f", {name} in {100 * _share_seen(found, number):.0f} %"
     return f"{text}."
 
 

@@ -7,14 +7,12 @@ from collections.abc import Iterator
 
 import torch
 
-from torchstickcal.quality.evidence import Evidence
+from torchstickcal.quality.evidence import DOUBTFUL_SHARE, Evidence
 from torchstickcal.quality.finding import Finding, Severity
 from torchstickcal.quality.registry import findings
 
-_AGREEING_SHARE, _DOUBTFUL_SHARE = 0.55, 0.7
+_AGREEING_SHARE = 0.55
 """Sound cameras keep 84 % of their keypoints and more, with 20 % of wrong ones 66 %; mirrored or alien ones 27 to 43 %."""
-_BEHIND_OTHERS = 0.85
-"""Share of a camera over the median of all, below which the camera, not the detector, is doubted."""
 _SAME_VIEW_RAD = 0.005
 """Mean angle between the rays of two cameras to the same points, below which they see one and the same view."""
 _LEAST_PARALLAX_DEG = 3.0
@@ -78,21 +76,21 @@ def _shares(evidence: Evidence) -> Iterator[Finding]:
             yield Finding(
                 "camera_contradicts",
                 Severity.SERIOUS,
-                f"{name}: only {share:.0%} of its keypoints agree with the other cameras; of a sound camera it is more "
+                f"{name}: only {100 * share:.0f} % of its keypoints agree with the other cameras; of a sound camera it is more "
                 "than 80 %.",
                 "Check that it shows the same athlete at the same time, that the video is not mirrored or turned, and that its "
                 "intrinsics are right.",
                 limit=_AGREEING_SHARE,
                 **common,
             )
-        elif share < _DOUBTFUL_SHARE and share < _BEHIND_OTHERS * median:
+        elif bool(evidence.doubtful[camera]):
             yield Finding(
                 "camera_doubtful",
                 Severity.CAUTION,
-                f"{name}: {share:.0%} of its keypoints agree with the other cameras, clearly fewer than of the others "
-                f"({median:.0%}).",
+                f"{name}: {100 * share:.0f} % of its keypoints agree with the other cameras, clearly fewer than of the others "
+                f"({100 * median:.0f} %).",
                 "Look at its video with the keypoints drawn into it.",
-                limit=_DOUBTFUL_SHARE,
+                limit=DOUBTFUL_SHARE,
                 **common,
             )
 
@@ -146,8 +144,8 @@ def _precision(evidence: Evidence) -> Iterator[Finding]:
             yield Finding(
                 "camera_imprecise",
                 Severity.SERIOUS if lost else Severity.CAUTION,
-                f"{evidence.camera(camera)}: its centre has a standard deviation of {1000 * std:.3g} mm, {std / rig:.1%} of "
-                "the size of the rig.",
+                f"{evidence.camera(camera)}: its centre has a standard deviation of {1000 * std:.3g} mm, "
+                f"{100 * std / rig:.1f} % of the size of the rig.",
                 "Record a longer motion that fills more of the images, or add cameras.",
                 cameras=(evidence.camera(camera),),
                 figure=std / rig,

@@ -110,8 +110,8 @@ def _mirrored(evidence: Evidence, places: dict[str, int]) -> Iterator[Finding]:
         yield Finding(
             "scene_mirrored",
             Severity.SERIOUS,
-            f"In {share:.0%} of the frames the athlete's right side is on the left: all videos are mirrored, and the rig is "
-            "its own mirror image, or the names of left and right are exchanged.",
+            f"In {100 * share:.0f} % of the frames the athlete's right side is on the left: all videos are mirrored, and the "
+            "rig is its own mirror image, or the names of left and right are exchanged.",
             "Mirror the keypoints of all cameras, x to width - 1 - x, or exchange the names.",
             figure=share,
             limit=_MIRRORED_SHARE,

@@ -10,22 +10,41 @@ from torchstickcal.metrics import rotation_angle
 from torchstickcal.quality.evidence import Evidence
 from torchstickcal.quality.finding import Finding, Severity
 from torchstickcal.quality.registry import findings
-from torchstickcal.quality.trials import Rest, Sight, hypotheses, moved_within, shifted_share, sight_of, tried, without
+from torchstickcal.quality.resection import Resection
+from torchstickcal.quality.trials import (
+    Hypothesis,
+    Rest,
+    Sight,
+    hypotheses,
+    moved_within,
+    shifted_share,
+    sight_of,
+    tried,
+    without,
+)
 
 _SOUND_SHARE, _GAIN, _CLEAR_GAIN = 0.6, 0.15, 0.08
 """Share of keypoints that agree in a sound camera, and the least gain of an explanation over none, where that is wrong and
 where it is nearly right."""
-_ALIKE = 0.05
-"""Difference of shares up to which the simpler of two explanations is the one."""
+_ALIKE, _ALIKE_DISTANCE = 0.05, 1.15
+"""Difference of shares, and ratio of distances, up to which the simpler of two explanations is the one."""
+_CLOSER = 0.8
+"""Ratio of distances from which on an explanation with an equal share is better than none."""
 _WHOLE_SHARE = 0.8
 _ALIEN_SHARE = 0.75
 """Share of a camera's keypoints that agree, over that of the others, below which it shows something else."""
+_IN_TIME_SHARE = 0.85
+"""The same at another time, from which on the camera shows the same thing then: others do similar things at other times."""
 _FARTHEST_DEG, _FARTHEST_SHARE = 45.0, 0.3
 """Largest change of a camera that is a motion of it, the shift as a share of the rig; beyond, it shows something else."""
 _MOST_SUSPECTS = 4
 _BEHIND_OTHERS = 0.75
 _SUSPECT_SHARE = 0.8
-_NOISE_RATIO, _NOISY_MRAD = 0.6, 8.0
+_NOISE_RATIO, _NOISY_MRAD = 0.6, 2.0
+"""Noise without a camera, over that with it, from which on the camera contradicts the others however many keypoints agree, and
+the noise above which that is looked at."""
+_NEAR_SIGMAS = 4.0
+"""Median distance of a camera's keypoints from the points of the others, in noise, within which an explanation is one."""
 
 
 @findings("causes", "why a camera contradicts the others, by trial", tries=True)
@@ -36,8 +55,9 @@ def causes(evidence: Evidence) -> Iterator[Finding]:
         return
     agreement = evidence.agreement * (1 - evidence.ended.labels.other_person[0].double().mean(1))
     order = agreement.argsort().tolist()
-    absurd = evidence.absurd_focals.tolist()
-    suspects = [camera for camera in order if float(agreement[camera]) < _SUSPECT_SHARE or absurd[camera]] or order
+    suspicious = (evidence.absurd_focals | evidence.off_centre).tolist()
+    off_centre = [camera for camera in order if evidence.off_centre[camera]]
+    suspects = off_centre or [c for c in order if float(agreement[c]) < _SUSPECT_SHARE or suspicious[c]] or order
     best: tuple[float, int, Rest] | None = None
     for camera in suspects[:_MOST_SUSPECTS]:
         rest = without(evidence, camera)
@@ -46,11 +66,11 @@ def causes(evidence: Evidence) -> Iterator[Finding]:
     if best is None:
         return
     _, camera, rest = best
-    worse = float(agreement[camera]) < _BEHIND_OTHERS * rest.share
+    worse = bool(evidence.doubtful[camera]) or float(agreement[camera]) < _BEHIND_OTHERS * rest.share
     noisy = evidence.noise_mrad > _NOISY_MRAD and rest.noise_mrad < _NOISE_RATIO * evidence.noise_mrad
-    if rest.share < _SOUND_SHARE or not (worse or noisy or absurd[camera]):
+    if rest.share < _SOUND_SHARE or not (worse or noisy or suspicious[camera]):
         return
-    if (finding := _explained(evidence, camera, rest)) is not None:
+    if (finding := _explained(evidence, camera, rest, 0.0 if noisy else float(evidence.agreement[camera]))) is not None:
         yield finding
 
 
@@ -58,8 +78,16 @@ def _soundness(rest: Rest) -> float:
     return rest.share - 0.02 * rest.noise_mrad
 
 
-def _explained(evidence: Evidence, camera: int, rest: Rest) -> Finding | None:
-    """What is wrong with the camera without which the others agree; None if nothing is."""
+def _explained(evidence: Evidence, camera: int, rest: Rest, agreement: float) -> Finding | None:
+    """What is wrong with the camera without which the others agree; None if nothing is.
+
+    Args:
+        evidence: of the session.
+        camera: which.
+        rest: the others.
+        agreement: share of the camera's keypoints that agree in the result; 0 where its noise is so large that this says
+            nothing.
+    """
     sight, name = sight_of(evidence, camera), evidence.camera(camera)
     plain = rest.placed(sight)
     as_given = 0.0 if plain is None else plain[0].share
@@ -68,7 +96,7 @@ def _explained(evidence: Evidence, camera: int, rest: Rest) -> Finding | None:
         return Finding(
             code,
             Severity.SERIOUS,
-            f"{name}: {what} ({share:.0%} of them; {as_given:.0%} as given).",
+            f"{name}: {what} ({100 * share:.0f} % of them; {100 * as_given:.0f} % as given).",
             advice,
             cameras=(name,),
             frames=frames,
@@ -78,17 +106,16 @@ def _explained(evidence: Evidence, camera: int, rest: Rest) -> Finding | None:
             is_cause=True,
         )
 
-    found = [(h, placed[0].share) for h in hypotheses() if (placed := rest.placed(h.changed(sight))) is not None]
-    largest = max((share for _, share in found), default=0.0)
-    hypothesis, share = next((one for one in found if one[1] >= largest - _ALIKE), (None, 0.0))
-    if hypothesis is not None and share > max(_SOUND_SHARE, as_given + (_GAIN if as_given < _SOUND_SHARE else _CLEAR_GAIN)):
-        return cause(hypothesis.code, hypothesis.what, hypothesis.advice, share)
+    found = [(h, placed[0]) for h in hypotheses() if (placed := rest.placed(h.changed(sight))) is not None]
+    if (best := _best(found)) is not None and _explains(best[1], None if plain is None else plain[0]):
+        hypothesis, placed = best
+        return cause(hypothesis.code, hypothesis.what, hypothesis.advice, placed.share)
     if as_given < _WHOLE_SHARE and (moved := moved_within(rest, sight)) is not None:
         finding = _moved(evidence, camera, *moved)
         if finding is not None:
             return finding
     if as_given > _SOUND_SHARE:
-        if as_given < float(evidence.agreement[camera]) + _CLEAR_GAIN:
+        if as_given < agreement + _CLEAR_GAIN:
             return None
         return cause(
             "camera_misplaced",
@@ -97,7 +124,7 @@ def _explained(evidence: Evidence, camera: int, rest: Rest) -> Finding | None:
             as_given,
         )
     later, share = shifted_share(rest, sight, evidence.ended.frames[0].rate_hz)
-    if later and share > _SOUND_SHARE and share > as_given + _GAIN:
+    if later and share > max(_SOUND_SHARE, _IN_TIME_SHARE * rest.share, as_given + _GAIN):
         word = "later" if later > 0 else "earlier"
         return cause(
             "clock_apart",
@@ -105,15 +132,32 @@ def _explained(evidence: Evidence, camera: int, rest: Rest) -> Finding | None:
             "Estimate the time offsets (refine 'time_offset'), or cut its video to begin with the others.",
             share,
         )
-    if float(evidence.agreement[camera]) > _ALIEN_SHARE * rest.share:
+    if agreement > _ALIEN_SHARE * rest.share:
         return None
     return cause(
         "camera_alien",
         "its keypoints agree with the other cameras at no place, neither mirrored, turned, scaled nor moved in time: it "
         "shows another person or another recording",
         "Check which person the detector follows in this camera, and whether the video belongs to this session.",
-        max([as_given, *(share for _, share in found)]),
+        max([as_given, *(placed.share for _, placed in found)]),
     )
+
+
+def _best(found: list[tuple[Hypothesis, Resection]]) -> tuple[Hypothesis, Resection] | None:
+    """The explanation by which most keypoints agree; of several that are alike, the closest, or the simplest."""
+    largest = max((placed.share for _, placed in found), default=0.0)
+    alike = [one for one in found if one[1].share >= largest - _ALIKE]
+    least = min((placed.distance_sigmas for _, placed in alike), default=0.0)
+    return next((one for one in alike if one[1].distance_sigmas <= _ALIKE_DISTANCE * least), None)
+
+
+def _explains(placed: Resection, plain: Resection | None) -> bool:
+    """Whether a camera as it would be by an explanation fits the others clearly better than as given."""
+    if placed.share < _SOUND_SHARE or placed.distance_sigmas > _NEAR_SIGMAS or plain is None:
+        return placed.share > _SOUND_SHARE and placed.distance_sigmas < _NEAR_SIGMAS
+    closer = placed.share > plain.share - _ALIKE and placed.distance_sigmas < _CLOSER * plain.distance_sigmas
+    gain = _GAIN if plain.share < _SOUND_SHARE else _CLEAR_GAIN
+    return closer or placed.share > plain.share + gain
 
 
 def _moved(evidence: Evidence, camera: int, frame: int, before: object, after: object) -> Finding | None:
@@ -146,8 +190,9 @@ def _of_a_pair(evidence: Evidence) -> Iterator[Finding]:
             keypoints, matrix = observations.keypoints.clone(), observations.cameras.matrix.clone()
             keypoints[camera] = changed.keypoints.to(keypoints)
             matrix[camera] = changed.camera.matrix[0]
-            ended = tried(replace(observations, keypoints=keypoints, intrinsics=matrix), evidence.config, ())
-            if ended is None or not ended.converged:
+            trial = replace(observations, keypoints=keypoints, intrinsics=matrix)
+            ended = tried(trial, evidence.config, (), must_converge=True)
+            if ended is None:
                 continue
             share = float(ended.kept.visible.sum() / ended.measurements.visible.sum().clamp_min(1))
             own = 1000 * float(ended.last.sigma_px[0].median() / ended.measurements.cameras.focal_px.mean())
@@ -156,7 +201,7 @@ def _of_a_pair(evidence: Evidence) -> Iterator[Finding]:
                 yield Finding(
                     hypothesis.code,
                     Severity.SERIOUS,
-                    f"{name}, or the other camera: {hypothesis.what} ({share:.0%} of them).",
+                    f"{name}, or the other camera: {hypothesis.what} ({100 * share:.0f} % of them).",
                     hypothesis.advice,
                     cameras=(name,),
                     figure=share,

@@ -19,11 +19,37 @@ _SAME_PX = 1.0
 """Median distance of the keypoints of two cameras below which it is one video. Different cameras have different noise."""
 
 
-@findings("images", "intrinsics of other images, keypoints outside the image, and the same video twice")
+@findings("images", "intrinsics of other images, and the same video twice", direct=True)
 def images(evidence: Evidence) -> Iterator[Finding]:
     """Findings about images and intrinsics."""
     yield from _intrinsics(evidence)
+    yield from _off_centre(evidence)
     yield from _same_video(evidence)
+
+
+@findings("outside", "keypoints outside the image")
+def outside(evidence: Evidence) -> Iterator[Finding]:
+    """Cameras many of whose keypoints lie outside the image: those of other images, or of another scene."""
+    observations = evidence.observations
+    if observations.image_size is None or not observations.intrinsics_known:
+        return
+    size = observations.image_size.double().expand(evidence.cameras, 2)
+    keypoints = observations.keypoints.double()
+    far = ((keypoints < -0.1 * size[:, None, None]) | (keypoints > 1.1 * size[:, None, None])).any(-1) & observations.visible
+    share = far.flatten(1).sum(1) / observations.visible.flatten(1).sum(1).clamp_min(1)
+    for camera in (share > _OUTSIDE_SHARE).nonzero().flatten().tolist():
+        name = evidence.camera(camera)
+        yield Finding(
+            "keypoints_outside_image",
+            Severity.SERIOUS,
+            f"{name}: {100 * float(share[camera]):.0f} % of its keypoints lie far outside its images.",
+            "Check the image size, and the resolution at which the detector ran.",
+            cameras=(name,),
+            figure=float(share[camera]),
+            limit=_OUTSIDE_SHARE,
+            unit="share",
+            is_cause=True,
+        )
 
 
 def _intrinsics(evidence: Evidence) -> Iterator[Finding]:
@@ -58,23 +84,20 @@ def _intrinsics(evidence: Evidence) -> Iterator[Finding]:
             unit="half images",
             is_cause=code != "principal_point_off_centre",
         )
-    keypoints = observations.keypoints.double()
-    outside = ((keypoints < -0.1 * size[:, None, None]) | (keypoints > 1.1 * size[:, None, None])).any(
-        -1
-    ) & observations.visible
-    share = outside.flatten(1).sum(1) / observations.visible.flatten(1).sum(1).clamp_min(1)
-    for camera in (share > _OUTSIDE_SHARE).nonzero().flatten().tolist():
+
+
+def _off_centre(evidence: Evidence) -> Iterator[Finding]:
+    """Cameras whose keypoints lie where the images of their intrinsics are not."""
+    for camera in evidence.off_centre.nonzero().flatten().tolist():
+        x, y = evidence.observations.cameras.matrix[camera, :2, 2].tolist()
         name = evidence.camera(camera)
         yield Finding(
-            "keypoints_outside_image",
-            Severity.SERIOUS,
-            f"{name}: {float(share[camera]):.0%} of its keypoints lie far outside its images.",
-            "Check the image size, and the resolution at which the detector ran.",
+            "keypoints_off_centre",
+            Severity.CAUTION,
+            f"{name}: its keypoints lie to one side of the principal point of its intrinsics, ({x:.0f}, {y:.0f}), or far from "
+            "it, as where the intrinsics are those of images of another size.",
+            "Check that the detector saw images of the size that the intrinsics are for.",
             cameras=(name,),
-            figure=float(share[camera]),
-            limit=_OUTSIDE_SHARE,
-            unit="share",
-            is_cause=True,
         )
 
 

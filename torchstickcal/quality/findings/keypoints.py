@@ -20,7 +20,7 @@ _NOISY_MRAD = 10.0
 """Good detectors have 1 to 4; mirrored or alien cameras raise the noise of all to 10 and more."""
 
 
-@findings("keypoints", "label errors, wrong, unused and noisy keypoints, and values that are no pixels")
+@findings("keypoints", "label errors, wrong, unused and noisy keypoints, and values that are no pixels", direct=True)
 def keypoints(evidence: Evidence) -> Iterator[Finding]:
     """Findings about keypoints."""
     yield from _values(evidence)
@@ -84,7 +84,7 @@ def _labels(evidence: Evidence) -> Iterator[Finding]:
             yield Finding(
                 "other_person",
                 Severity.SERIOUS if count > _OTHER_PERSON_SHARE * frames else Severity.NOTE,
-                f"{evidence.camera(camera)}: {count} of {frames} frames were not used: all their keypoints contradict the "
+                f"{evidence.camera(camera)}: {count} of {frames} frames were set aside: all their keypoints contradict the "
                 "other cameras, as if they showed another person.",
                 "Check which person the detector follows in this camera." if count > _OTHER_PERSON_SHARE * frames else "",
                 cameras=(evidence.camera(camera),),
@@ -95,26 +95,29 @@ def _labels(evidence: Evidence) -> Iterator[Finding]:
 
 
 def _used(evidence: Evidence) -> Iterator[Finding]:
-    """Keypoints that took no part."""
-    observations, measurements, ended = evidence.observations, evidence.measurements, evidence.ended
-    comparable, kept = int(measurements.visible.sum()), int(ended.last.inliers.sum())
-    takes_part = measurements.by_frame(measurements.active[0]).any(0)
-    same_person = ~ended.frames[0].to_own(ended.labels.other_person[0], False)
-    seen = int((observations.visible[:, :, takes_part] & same_person[..., None]).sum())
-    if seen > comparable:
+    """Keypoints that were set aside: those that no second camera saw, and those that contradict the others."""
+    observations, ended = evidence.observations, evidence.ended
+    frames, measurements = ended.frames[0], ended.measurements
+    seen = observations.visible & ~frames.to_own(ended.labels.other_person[0], False)[..., None]
+    compared = frames.to_own(measurements.by_frame(measurements.visible[0]), False) & seen
+    used = frames.to_own(measurements.by_frame(ended.last.inliers[0]), False)
+    total, alone = int(observations.visible.sum()), int(seen.sum() - compared.sum())
+    if alone:
         yield Finding(
             "keypoints_unused",
             Severity.NOTE,
-            f"{seen - comparable} of {seen} keypoints were not used: no second camera saw the point in that frame.",
-            figure=(seen - comparable) / seen,
+            f"{alone} of {total} keypoints were set aside: no second camera saw the point in that frame.",
+            figure=alone / total,
             unit="share",
         )
-    if comparable > kept:
-        share = (comparable - kept) / comparable
+    contradict, comparable = int(compared.sum() - used.sum()), int(compared.sum())
+    if contradict:
+        share = contradict / comparable
         yield Finding(
             "keypoints_rejected",
             Severity.CAUTION if share > _REJECTED_SHARE else Severity.NOTE,
-            f"{comparable - kept} of {comparable} keypoints ({share:.1%}) were rejected: they contradict the others.",
+            f"{contradict} of {total} keypoints were set aside: they contradict the others ({100 * share:.1f} % of those that "
+            "could be compared).",
             figure=share,
             limit=_REJECTED_SHARE,
             unit="share",

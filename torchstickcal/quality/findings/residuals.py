@@ -4,15 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-import torch
-
-from torchstickcal.quality.evidence import Evidence
+from torchstickcal.quality.evidence import CONSTANT_SIGMAS, Evidence
 from torchstickcal.quality.finding import Finding, Severity
 from torchstickcal.quality.registry import findings
 
 _LASTING_FRAMES = 3.0
-_BIASED_SIGMAS = 0.5
-_LEAST_FRAMES = 20
 
 
 @findings("residuals", "errors of the keypoints that last, or are always the same")
@@ -29,18 +25,8 @@ def residuals(evidence: Evidence) -> Iterator[Finding]:
             limit=_LASTING_FRAMES,
             unit="frames",
         )
-    m = evidence.kept
-    sums = torch.zeros(evidence.cameras, 2, m.points_per_frame, dtype=torch.float64, device=m.pixels.device)
-    for columns, found, _ in m.residuals(evidence.state):
-        seen = m.visible[0][:, None, columns]
-        sums += found[0].double().where(seen, 0.0).unflatten(-1, (-1, m.points_per_frame)).sum(-2)
-    count = m.by_frame(m.visible[0]).sum(1)
-    mean = sums / count.clamp_min(1)[:, None] / evidence.sigma_px
-    enough = (count >= _LEAST_FRAMES)[:, None].expand_as(mean)
-    if not bool(enough.any()):
-        return
-    bias = float(mean[enough].square().mean().sqrt())
-    if bias > _BIASED_SIGMAS:
+    bias = evidence.constant_errors_sigmas
+    if bias > CONSTANT_SIGMAS:
         yield Finding(
             "errors_constant",
             Severity.NOTE,
@@ -48,6 +34,6 @@ def residuals(evidence: Evidence) -> Iterator[Finding]:
             "differently in different views.",
             "Such errors do not become smaller with more frames, but with more directions from which the athlete is seen.",
             figure=bias,
-            limit=_BIASED_SIGMAS,
+            limit=CONSTANT_SIGMAS,
             unit="noise",
         )

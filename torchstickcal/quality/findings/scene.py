@@ -83,7 +83,7 @@ def _size(evidence: Evidence) -> Iterator[Finding]:
             yield Finding(
                 "athlete_small",
                 Severity.NOTE,
-                f"{name}: the athlete fills {share:.0%} of the height of the image, so that its pixels are worth little.",
+                f"{name}: the athlete fills {100 * share:.0f} % of the height of the image, so that pixels are worth little.",
                 "Move the camera closer, or use a longer focal length.",
                 cameras=(name,),
                 figure=share,
@@ -109,7 +109,7 @@ def _upside_down(evidence: Evidence) -> Iterator[Finding]:
             yield Finding(
                 "image_upside_down",
                 Severity.NOTE,
-                f"{name}: the head is below the feet in {share:.0%} of the frames: the camera is upside down.",
+                f"{name}: the head is below the feet in {100 * share:.0f} % of the frames: the camera is upside down.",
                 "If the video was turned after the intrinsics were estimated, turn their principal point and distortion too.",
                 cameras=(name,),
                 figure=share,

@@ -88,7 +88,7 @@ def _scale(evidence: Evidence) -> Iterator[Finding]:
         yield Finding(
             "scale_imprecise",
             Severity.SERIOUS if unknown else Severity.CAUTION,
-            f"The scale has a standard deviation of {std:.1%}: all distances are uncertain by this share.",
+            f"The scale has a standard deviation of {100 * std:.1f} %: all distances are uncertain by this share.",
             "Measure the stick's length better (Stick.sigma_m), and record it for longer and closer to the cameras."
             if len(kept.sticks)
             else "Record a stick of known length: nothing else gives a scale that is better than a few per cent.",
@@ -162,8 +162,8 @@ def _lengths(evidence: Evidence) -> Iterator[Finding]:
             yield Finding(
                 "lengths_outside",
                 Severity.CAUTION,
-                f"Of the lengths of {errors.stick} in frames that took no part, {errors.inside:.0%} are inside their 95 % "
-                f"intervals; their standard deviation is {1000 * errors.std_m:.3g} mm.",
+                f"Of the lengths of {errors.stick} in frames that took no part, {100 * errors.inside:.0f} % are inside their "
+                f"95 % intervals; their standard deviation is {1000 * errors.std_m:.3g} mm.",
                 "The keypoints of its ends have errors that last, or the cameras are less precise than is said.",
                 points=tuple(errors.stick.split(" - ")),
                 figure=errors.inside,

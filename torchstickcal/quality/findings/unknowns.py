@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 from torchstickcal.model.unknowns import CameraUnknown, all_unknowns
-from torchstickcal.quality.evidence import Evidence
+from torchstickcal.quality.evidence import CONSTANT_SIGMAS, Evidence
 from torchstickcal.quality.finding import Finding, Severity
 from torchstickcal.quality.lags import frames_are_apart
 from torchstickcal.quality.registry import findings
@@ -19,7 +19,11 @@ _WRONG_FOCAL = 0.02
 """Error of a focal length from which on the camera's distance is wrong by 2 %. Biased keypoints alone make 1 to 2 %."""
 _ANOTHER_CAMERA = 0.3
 """Error of a focal length that no calibration of the same camera makes: an estimate that far away is doubted too."""
+_FAR_FOCAL, _FAR_SIGMAS = 0.03, 3.0
+"""Error of a focal length that no careful calibration makes, from which on less evidence is enough, where the errors of the
+keypoints are not always the same."""
 _IN_STEP_FRAMES = 0.15
+_IN_COMMON_SHARE, _LITTLE_IN_COMMON_SHARE = 0.6, 0.5
 _WRONG_FRAMES = 0.5
 """Time offset, in frames, from which on the clocks matter."""
 
@@ -44,11 +48,31 @@ def clocks(evidence: Evidence) -> Iterator[Finding]:
             "Estimate the time offsets (refine 'time_offset').",
             is_cause=evidence.explains_most("clock"),
         )
+    yield from _little_in_common(evidence)
     for camera, reason in enumerate(evidence.clocks.reasons if evidence.clocks is not None else ()):
         if reason:
             name = evidence.camera(camera)
             yield Finding(
                 "time_offset_uncertain", Severity.CAUTION, f"{name}: its time offset is uncertain, {reason}.", cameras=(name,)
+            )
+
+
+def _little_in_common(evidence: Evidence) -> Iterator[Finding]:
+    """Cameras of which little is compared with the others, by a time offset that was searched for."""
+    for camera, share in enumerate(evidence.in_common.tolist() if evidence.clocks is not None else ()):
+        if share < _IN_COMMON_SHARE:
+            name, little = evidence.camera(camera), share < _LITTLE_IN_COMMON_SHARE
+            yield Finding(
+                "little_in_common",
+                Severity.SERIOUS if little else Severity.CAUTION,
+                f"{name}: by the time offset that was found, only {100 * share:.0f} % of its keypoints are of times and points "
+                "that the other cameras see: two recordings have so much in common by chance.",
+                "Check that its video belongs to this session, and cut the videos so that they begin at the same time.",
+                cameras=(name,),
+                figure=share,
+                limit=_LITTLE_IN_COMMON_SHARE if little else _IN_COMMON_SHARE,
+                unit="share",
+                is_cause=little,
             )
 
 
@@ -77,7 +101,9 @@ def _contradicted(evidence: Evidence, unknown: CameraUnknown, parameter: CameraP
     names = ("value", "std") if parameter.refined else ("suggested", "suggested_std")
     first = (parameter.by_component(name)[:, 0].tolist() for name in (*names, "given", "prior_std"))
     for camera, (value, std, given, prior_std) in enumerate(zip(*first, strict=True)):
-        if not abs(value - given) > max(_CONTRADICTED_SIGMAS * std, unknown.noticeable_prior_share * prior_std):
+        unusual = unknown.name == "focal" and not parameter.refined and abs(value - given) > _FAR_FOCAL * abs(given)
+        limit = _FAR_SIGMAS if unusual and evidence.constant_errors_sigmas < CONSTANT_SIGMAS else _CONTRADICTED_SIGMAS
+        if not abs(value - given) > max(limit * std, unknown.noticeable_prior_share * prior_std):
             continue
         matters = not parameter.refined and _matters(evidence, unknown.name, value - given, given)
         far = parameter.refined and unknown.name == "focal" and abs(value - given) > _ANOTHER_CAMERA * abs(given)
@@ -96,7 +122,7 @@ def _contradicted(evidence: Evidence, unknown: CameraUnknown, parameter: CameraP
             advice,
             cameras=(name,),
             figure=(value - given) / std if std > 0 else None,
-            limit=_CONTRADICTED_SIGMAS,
+            limit=limit,
             unit="standard deviations",
             is_cause=matters and evidence.explains_most(unknown.family),
         )
