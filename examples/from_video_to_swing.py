@@ -2,10 +2,11 @@
 
     python examples/from_video_to_swing.py --sessions 4 --seconds 1.2 --fps 120
 
-Four cameras of 1280 x 720 film an athlete whose stick carries two pieces of tape: with motion blur, noise, and a cluttered
-background that has things of the tape's colours too. The videos are written with OpenCV and read again. The body is drawn
+Four cameras of 1280 x 720 film an athlete whose stick carries two coloured balls, or two pieces of tape with --tape: with
+motion blur, noise, and a cluttered background that has things of their colours too. The videos are written with OpenCV and
+read again. The body is drawn
 without a face or clothes, which no pose network knows: body keypoints are the true ones with errors of 3 px. The same session
-is also calibrated with the true places of the tape, with independent errors of the same median: ideal ends.
+is also calibrated with the true places of the marks, with independent errors of the same median: ideal ends.
 """
 
 from __future__ import annotations
@@ -13,7 +14,7 @@ from __future__ import annotations
 import argparse
 import tempfile
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -36,6 +37,8 @@ SPORTS = ("golf", "baseball", "hockey", "kendo")
 BEGIN_S = {"golf": 1.1, "baseball": 1.0, "hockey": 1.85, "kendo": 0.85}
 """When the fast part of the swing begins"""
 CAMERAS, SIZE = 4, (1280, 720)
+BALL_M = 0.065
+"""Diameter of a tennis ball"""
 WRONG_PX = 5.0
 MEDIAN_OVER_SIGMA = 1.1774
 """Of the length of an error whose parts along x and y are normally distributed"""
@@ -59,18 +62,20 @@ class Recorded:
     markers: Markers
     times: Array
     points: Array
-    """(F, 21, 3): joints and the centres of both pieces of tape"""
+    """(F, 21, 3): joints and the centres of both marks"""
     body: Array
     """(C, F, 19, 3), keypoints of the joints with errors"""
     speeds: Array
-    """(F, 2), of the tape, metres per second"""
+    """(F, 2), of the marks, metres per second"""
 
 
-def record(folder: Path, sport: str, seed: int, seconds: float, fps: float, exposure_s: float) -> Recorded:
+def record(folder: Path, sport: str, seed: int, seconds: float, fps: float, exposure_s: float, balls: bool = True) -> Recorded:
     """Render and write a video for each camera."""
     rng = np.random.default_rng(seed)
     rig = camera_rig("ring", CAMERAS, rng, Lens(image_size=SIZE), 4.5)
     motion, markers = Motion(action(sport), seed=seed), markers_of(action(sport))
+    if balls:
+        markers = replace(markers, balls=True, diameter_m=BALL_M)
     times = BEGIN_S[sport] + np.arange(round(seconds * fps)) / fps
     for camera in range(CAMERAS):
         film = CameraFilm(rig, camera, motion, markers, Exposure(exposure_s), seed)
@@ -142,6 +147,7 @@ def main() -> None:
     arguments.add_argument("--seconds", type=float, default=0.5, help="of each session (default: 0.5)")
     arguments.add_argument("--fps", type=float, default=60.0, help="frames per second (default: 60)")
     arguments.add_argument("--exposure", type=float, default=0.001, help="of each frame, seconds (default: 0.001)")
+    arguments.add_argument("--tape", action="store_true", help="two pieces of tape instead of two balls")
     options = arguments.parse_args()
     torch.set_num_threads(1)
     errors, fast_errors, wrong, seen, ratios = [], [], 0, 0, []
@@ -149,7 +155,7 @@ def main() -> None:
         sport = SPORTS[number % len(SPORTS)]
         with tempfile.TemporaryDirectory() as temporary:
             folder = Path(temporary)
-            session = record(folder, sport, 300 + number, options.seconds, options.fps, options.exposure)
+            session = record(folder, sport, 300 + number, options.seconds, options.fps, options.exposure, not options.tape)
             found = found_in_videos(folder, session)
         true = session.rig.project(np.repeat(session.points[None, :, -2:], CAMERAS, axis=0))
         apart = np.linalg.norm(found.keypoints[:, :, -2:].double().numpy() - true, axis=-1)

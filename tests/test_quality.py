@@ -20,7 +20,7 @@ from torchstickcal import Calibration, Finding, Observations, Quality, Severity,
 from torchstickcal.cli import main
 from torchstickcal.errors import ObservationError
 from torchstickcal.geometry import se3
-from torchstickcal.io import write_npz
+from torchstickcal.io import load_session, write_npz
 from torchstickcal.model.unknowns import all_unknowns
 from torchstickcal.quality.evidence import Evidence
 from torchstickcal.quality.findings.unknowns import _contradicted, _little_in_common
@@ -309,6 +309,81 @@ def test_a_family_of_findings_of_ones_own():
         FAMILIES._things.pop("test_slow")
     assert quality.verdict is Verdict.USABLE
     assert [finding.text for finding in quality.reasons] == ["The frame rate is low. Record faster."]
+
+
+class TestOffsets:
+    """A stick whose detected point lies inside its end."""
+
+    @staticmethod
+    def length_of(given: SimulatedSession, start: int, end: int) -> float:
+        points = given.truth.points
+        assert points is not None
+        return float((points[:, end] - points[:, start]).norm(dim=-1).mean())
+
+    @pytest.mark.parametrize(
+        ("sport", "offset_m", "at_start"), [("golf", 0.15, True), ("kendo", 0.08, False), ("golf", -0.03, True)]
+    )
+    def test_a_second_length_tells_the_offset(self, sport: str, offset_m: float, at_start: bool):
+        given = session(sport)
+        start, end = given.observations.sticks[0].ends
+        length_m = self.length_of(given, start, end)
+        names = given.observations.point_names
+        assert names is not None
+        forearm = names.index("left_elbow"), names.index("left_wrist")
+        unknown = Stick(start, end, length_m + offset_m, **{"start_offset_m" if at_start else "end_offset_m": None})
+        second = Stick(*forearm, self.length_of(given, *forearm))
+        calibration = calibrate(replace(given.observations, sticks=[unknown, second]))
+        found = next(f for f in calibration.quality.findings if f.code == "stick_offset")
+        assert found.figure == pytest.approx(offset_m, abs=0.01)
+        assert found.points == (names[start if at_start else end],)
+        assert "stick_offset_undetermined" not in codes(calibration.quality)
+        assert calibration.stick_lengths_m.shape[1] == 2
+
+    @pytest.mark.parametrize("offset_m", [0.15, -0.05])
+    def test_a_known_offset_is_part_of_the_length(self, offset_m: float):
+        given = session()
+        start, end = given.observations.sticks[0].ends
+        plain = Stick(start, end, self.length_of(given, start, end))
+        longer = Stick(start, end, plain.length_m + offset_m, end_offset_m=offset_m)
+        assert longer.between_m == pytest.approx(plain.length_m)
+        centres = [calibrate(replace(given.observations, sticks=stick)).camera_centres for stick in (plain, longer)]
+        torch.testing.assert_close(*centres, rtol=0, atol=1e-6)
+
+    def test_the_only_stick_does_not_tell_its_offset(self):
+        given = session()
+        start, end = given.observations.sticks[0].ends
+        sticks = Stick(start, end, 1.0), Stick(start, end, 1.0, start_offset_m=None)
+        known, unknown = (calibrate(replace(given.observations, sticks=stick)) for stick in sticks)
+        torch.testing.assert_close(known.camera_centres, unknown.camera_centres)
+        found = next(f for f in unknown.quality.findings if f.code == "stick_offset_undetermined")
+        assert found.severity == Severity.SERIOUS
+        assert "1 % too long" in found.text
+
+    def test_offsets_are_kept_in_files(self, tmp_path: Path):
+        given = session()
+        start, end = given.observations.sticks[0].ends
+        sticks = Stick(start, end, 1.1, end_offset_m=0.1), Stick(0, 1, 0.5, start_offset_m=None)
+        write_npz(tmp_path / "a.npz", replace(given.observations, sticks=sticks))
+        assert load_session(tmp_path / "a.npz").observations.sticks == sticks
+
+    def test_offsets_that_cannot_be_are_refused(self, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+        for offsets in ({"start_offset_m": None, "end_offset_m": None}, {"start_offset_m": 1.2}, {"end_offset_m": "long"}):
+            with pytest.raises(ObservationError, match="offset"):
+                Stick(0, 1, 1.0, **offsets)
+        write_npz(tmp_path / "a.npz", session().observations)
+        arguments = [
+            "calibrate",
+            str(tmp_path / "a.npz"),
+            "--stick",
+            "club_grip",
+            "club_head",
+            "1.1",
+            "--out",
+            str(tmp_path / "o"),
+        ]
+        for offset, message in ((["club_head", "far"], "not a length"), (["left_wrist", "0.1"], "no end of a stick")):
+            assert main([*arguments, "--stick-offset", *offset]) == 2
+            assert message in capsys.readouterr().err
 
 
 class TestOldCalibration:

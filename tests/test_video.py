@@ -23,7 +23,9 @@ from torchstickcal.simulate.footage import CameraFilm, Exposure, Markers, marker
 from torchstickcal.simulate.rigs import camera_rig
 from torchstickcal.video import detect, detect_video, frames_of, video_info
 from torchstickcal.video.frames import frame_numbers
-from torchstickcal.video.tape import HUES, Background, Candidate, TapeTrack, candidates, check_colours, learned
+from torchstickcal.video.patch import Patch
+from torchstickcal.video.shaft import shaft_in, shaft_track
+from torchstickcal.video.tape import HUES, Background, Candidate, TapeTrack, candidates, check_colours, ends_of, learned
 
 GREY, RED, YELLOW = (110, 105, 100), (30, 25, 215), (25, 220, 235)
 SIZE = (320, 240)
@@ -140,7 +142,7 @@ class TestTape:
         track.found[15] = [Candidate(85.0, 72.0, 40.0, 8.0)]  # half hidden
         track.found[20] = []
         track.near[25] = (300.0, 200.0, 20.0)  # far from the hands
-        ends = track.ends()
+        ends = ends_of([track])[0]
         unsure = np.flatnonzero(np.isnan(ends[:, 0])).tolist()
         assert unsure == [5, 10, 15, 20, 25]
         np.testing.assert_allclose(ends[7, :2], [45.0, 54.9])
@@ -150,13 +152,122 @@ class TestTape:
         track = TapeTrack()
         for _ in range(10):
             track.add([])
-        assert np.isnan(track.ends()[:, :2]).all()
+        assert np.isnan(ends_of([track])[0][:, :2]).all()
 
     def test_colours_that_are_none_are_refused(self):
         check_colours(list(HUES))
         for names in (["red", "red"], ["reed"], []):
             with pytest.raises(CalibrationError, match="--tape"):
                 check_colours(names)
+
+
+def ball(stick_px: float, turned_deg: float, covered: bool = False) -> tuple[Patch, np.ndarray]:
+    """A ball at (30, 30) and a stick that comes out of it towards the camera, or a hand that covers one side."""
+    x, y = np.meshgrid(np.arange(60.0), np.arange(60.0))
+    axis = np.array([np.cos(np.radians(turned_deg)), np.sin(np.radians(turned_deg))])
+    along, across = (x - 30) * axis[0] + (y - 30) * axis[1], (y - 30) * axis[0] - (x - 30) * axis[1]
+    shares = np.clip(9.5 - np.hypot(x - 30, y - 30), 0, 1)
+    front = (along > 3) & ((np.abs(across) < stick_px / 2) | covered)
+    behind = (along < 0) & (np.abs(across) < stick_px / 2) & (shares == 0)
+    return Patch(np.where(front, 0, shares).astype(np.float32), front | behind, (0, 0)), axis
+
+
+class TestPatch:
+    @pytest.mark.parametrize("turned_deg", [0.0, 35.0, 90.0, 200.0])
+    @pytest.mark.parametrize("stick_px", [3.0, 5.0])
+    def test_the_stick_in_front_does_not_move_the_centre(self, stick_px: float, turned_deg: float):
+        patch, axis = ball(stick_px, turned_deg)
+        assert abs((patch.centre - 30) @ axis) > 0.3
+        for direction in (axis, -3 * axis):
+            centre = patch.centre_on(direction)
+            assert centre is not None
+            np.testing.assert_allclose(centre, [30, 30], atol=0.25)
+
+    @pytest.mark.parametrize("turned_deg", [0.0, 120.0])
+    def test_no_centre_where_one_side_is_covered(self, turned_deg: float):
+        patch, axis = ball(4.0, turned_deg, covered=True)
+        assert patch.centre_on(axis) is None
+
+
+class TestShaft:
+    HANDS, BODY_PX = (100.0, 180.0), 200.0
+
+    def frame(
+        self,
+        end: tuple[float, float],
+        background: np.ndarray,
+        colour: tuple[int, int, int] = (40, 40, 45),
+        swept_px: float = 0.0,
+    ) -> np.ndarray:
+        """A body, hands and a shaft whose far end sweeps over some pixels along x during the exposure."""
+        mean, steps = np.zeros(background.shape), max(1, int(2 * swept_px))
+        for step in range(steps):
+            drawn = background.copy()
+            tip = end[0] + swept_px * ((step + 0.5) / steps - 0.5), end[1]
+            (x0, y0), (x1, y1) = ((round(16 * x), round(16 * y)) for x, y in (self.HANDS, tip))
+            cv2.line(drawn, (x0, y0), (x1, y1), colour, 3, cv2.LINE_AA, 4)
+            cv2.rectangle(drawn, (60, 150), (98, 239), (90, 60, 50), -1)
+            cv2.circle(drawn, (100, 180), 9, (140, 165, 200), -1)
+            mean += drawn / steps
+        noise = np.random.default_rng(0).normal(0, 2.0, mean.shape)
+        return np.clip(mean + noise, 0, 255).astype(np.uint8)
+
+    def found(self, image: np.ndarray, background: np.ndarray) -> np.ndarray:
+        return shaft_in(image, background.astype(np.float32), self.HANDS, self.BODY_PX)
+
+    @pytest.mark.parametrize(
+        ("end", "swept_px"), [((200.0, 60.0), 0.0), ((90.0, 40.0), 0.0), ((230.0, 190.0), 0.0), ((190.0, 70.0), 8.0)]
+    )
+    def test_the_end_is_where_the_line_stops(self, end: tuple[float, float], swept_px: float):
+        cluttered = EMPTY.copy()
+        for k in range(6):
+            cv2.line(cluttered, (20 + 40 * k, 10), (140 + 30 * k, 230), (150, 150, 60), 3, cv2.LINE_AA)
+        for background in (EMPTY, cluttered):
+            shaft = self.found(self.frame(end, background, swept_px=swept_px), background)
+            assert shaft[1, 2] > 0.1
+            np.testing.assert_allclose(shaft[1, :2], end, atol=3.0)
+            assert np.linalg.norm(shaft[0, :2] - self.HANDS) < 2
+
+    def test_no_end_rather_than_a_wrong_one(self):
+        alike = EMPTY.copy()
+        cv2.rectangle(alike, (150, 20), (319, 120), (40, 40, 45), -1)
+        unknown = EMPTY.astype(np.float32)
+        unknown[20:120, 150:] = np.nan
+        without = self.frame(self.HANDS, EMPTY)
+        for image, background in (
+            (without, EMPTY),  # no stick
+            (self.frame((200.0, 60.0), alike), alike),  # the far part is in front of something of its colour
+            (self.frame((200.0, 60.0), EMPTY), unknown),  # the background is not known there
+            (self.frame((200.0, 60.0), EMPTY, colour=(104, 100, 96)), EMPTY),  # hardly another colour than the background
+            (self.frame((300.0, -40.0), EMPTY), EMPTY),  # it leaves the image
+        ):
+            assert np.isnan(self.found(image, background)[:, :2]).all()
+        thing = self.frame((200.0, 60.0), EMPTY)
+        cv2.rectangle(thing, (185, 30), (240, 75), (90, 60, 50), -1)  # a thing that came in hides the end
+        assert np.isnan(self.found(thing, EMPTY)[:, :2]).all()
+
+    def test_ends_that_jump_are_left_out(self):
+        ends = [np.array([[100.0, 180.0, 0.8], [150.0 + 4 * k, 60.0, 0.8]]) for k in range(12)]
+        ends[6] = ends[6] + [[0, 0, 0], [0, 40, 0]]
+        track = shaft_track(ends)
+        assert np.flatnonzero(np.isnan(track[:, 1, 0])).tolist() == [6]
+
+    def test_in_a_video(self, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+        tips = [(120.0 + 4 * k, 60.0 + k) for k in range(24)]
+        frames = [EMPTY] * 12 + [self.frame(tip, EMPTY) for tip in tips]
+        path = written(tmp_path / "a.mp4", frames, 60.0)
+        person = np.zeros((len(frames), 17, 3))
+        person[12:, :, :] = np.linspace([60, 60, 1], [98, 239, 1], 17)
+        person[12:, 9:11, :2] = self.HANDS
+        found = detect_video(path, "a", Scripted(person), shaft=True, skeleton="coco-17")
+        assert found.points[-2:] == ("shaft_hands", "shaft_end")
+        seen = found.keypoints[:, -1, 2] > 0
+        assert seen[12:].mean() > 0.5
+        assert not seen[:12].any()
+        apart = np.linalg.norm(found.keypoints[12:, -1, :2] - tips, axis=-1)[seen[12:]]
+        assert apart.max() < 4
+        assert main(["detect", str(path), "--shaft", "--out", str(tmp_path / "out")]) == 2
+        assert "the hands are not known" in capsys.readouterr().err
 
 
 class Scripted:

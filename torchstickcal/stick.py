@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 from torchstickcal.arrays import index_of, items_of, name_of, number_of
@@ -28,9 +28,14 @@ class Stick:
         sigma_m: standard deviation of the length, metres: how well it was measured and how rigid the stick is. Its error is the
             same in all frames and enters the scale's deviation. A limb that stands in for a stick is known to a few centimetres
             at best.
+        start_offset_m, end_offset_m: how far inside the stick the detected point lies from its true end, metres, where this is
+            the same in all frames: a grip that the hands hide. Negative beyond the end. None for one of them if it is not
+            known: the stick then takes no part in the scale, and the offset is estimated, if another stick sets the scale.
+            Nothing can tell the offset of the only stick from its length.
 
     Raises:
-        ObservationError: if the ends are no points or the same one, or the length or its deviation are no lengths in metres.
+        ObservationError: if the ends are no points or the same one, if the length, its deviation or an offset are no lengths in
+            metres, if the offsets leave nothing of the length, or if both are unknown.
 
     Example:
         >>> Stick(19, 20, 1.0)
@@ -43,6 +48,8 @@ class Stick:
     end: int | str
     length_m: float
     sigma_m: float = 0.001
+    start_offset_m: float | None = field(default=0.0, repr=False)
+    end_offset_m: float | None = field(default=0.0, repr=False)
 
     def __post_init__(self) -> None:
         for name in ("start", "end"):
@@ -74,6 +81,48 @@ class Stick:
                 expected=f"metres, at most {_LONGEST_STICK_M:g}",
                 remedy=f"Divide by {factor}: {self.length_m / factor:g} m.",
             )
+        self._check_offsets()
+
+    def _check_offsets(self) -> None:
+        for name in ("start_offset_m", "end_offset_m"):
+            if getattr(self, name) is None:
+                continue
+            expected = f"one number, metres, {-_LONGEST_STICK_M:g} to {_LONGEST_STICK_M:g}, or None if it is not known"
+            given, most = getattr(self, name), _LONGEST_STICK_M
+            offset = number_of(given, f"Stick.{name}", what="not an offset", expected=expected, least=-most, most=most)
+            object.__setattr__(self, name, offset)
+        if self.start_offset_m is None and self.end_offset_m is None:
+            raise ObservationError(
+                "both offsets of a stick are unknown",
+                where="Stick",
+                got="start_offset_m = end_offset_m = None",
+                expected="one unknown offset",
+                remedy="Put a mark on the stick and give each end its own Stick, from the mark to the end.",
+            )
+        if self.between_m < _SHORTEST_STICK_M:
+            raise ObservationError(
+                "the offsets leave nothing of a stick",
+                where="Stick",
+                got=f"offsets {self.start_offset_m!r}, {self.end_offset_m!r} of {self.length_m:g} m",
+                expected="offsets that are shorter than the stick",
+            )
+
+    @property
+    def between_m(self) -> float:
+        """The distance between the detected points, metres: the length without the known offsets.
+
+        Example:
+            >>> round(Stick("grip", "head", 1.1, start_offset_m=0.12).between_m, 3)
+            0.98
+        """
+        return self.length_m - (self.start_offset_m or 0.0) - (self.end_offset_m or 0.0)
+
+    @property
+    def unknown_end(self) -> int | str | None:
+        """The end whose offset is not known; None where both are known."""
+        if self.start_offset_m is None:
+            return self.start
+        return self.end if self.end_offset_m is None else None
 
     @property
     def ends(self) -> tuple[int, int]:
@@ -96,6 +145,11 @@ class Stick:
         """
         start, end = (point_index(end, point_names) if isinstance(end, str) else end for end in (self.start, self.end))
         return replace(self, start=start, end=end)
+
+
+def scale_sticks(sticks: Sequence[Stick]) -> list[Stick]:
+    """The sticks that set the scale: those without an unknown offset, or all where every stick has one."""
+    return [stick for stick in sticks if stick.unknown_end is None] or list(sticks)
 
 
 def point_index(name: str, point_names: Sequence[str] | None) -> int:

@@ -300,6 +300,8 @@ def _add_detectors(command: argparse.ArgumentParser) -> None:
         help="videos: colours of tape or balls on the stick's ends, the end in the hands first: red, orange, yellow, green, "
         "cyan, blue, magenta; the cameras must stand still",
     )
+    help = "videos: find a stick without marks as a line from the hands, by the body's keypoints; the cameras must stand still"
+    add("--shaft", action="store_true", help=help)
 
 
 def _add_analyse(commands: Any) -> None:
@@ -522,6 +524,14 @@ def _add_recording(command: argparse.ArgumentParser) -> None:
         nargs=3,
         action="append",
         help="a stick: two points and the metres between them; may be given several times (default: the session's)",
+    )
+    add(
+        "--stick-offset",
+        metavar=("POINT", "METRES"),
+        nargs=2,
+        action="append",
+        help="how far inside the stick this end of a --stick is detected: a grip that the hands hide; `unknown` to estimate "
+        "it, where another stick sets the scale",
     )
     add(
         "--stick-points", metavar="PATH", type=_path, help="keypoints of the stick's ends, where they are in files of their own"

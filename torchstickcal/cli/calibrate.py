@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from torchstickcal.observations import Observations
     from torchstickcal.pipeline.calibrate import Callback
     from torchstickcal.result import Calibration
+    from torchstickcal.stick import Stick
 
 
 def calibrate_session(options: argparse.Namespace) -> int:
@@ -77,6 +78,7 @@ def given_of(options: argparse.Namespace) -> Given:
     from torchstickcal.stick import Stick
 
     sticks = [Stick(_end(start), _end(end), _metres(length)) for start, end, length in options.stick or ()]
+    sticks = _with_offsets(sticks, options.stick_offset or ())
     return Given(
         stick=sticks or None,
         intrinsics=options.intrinsics,
@@ -101,13 +103,33 @@ def _end(text: str) -> int | str:
     return int(text) if text.isascii() and text.isdecimal() else text
 
 
-def _metres(text: str) -> float:
+def _with_offsets(sticks: Sequence[Stick], offsets: Sequence[tuple[str, str]]) -> list[Stick]:
+    """The sticks with the offsets (point, metres or "unknown") of their ends.
+
+    Raises:
+        CalibrationError: if a point is no end of a stick.
+    """
+    for point, text in offsets:
+        offset_m = None if text == "unknown" else _metres(text, "--stick-offset", "POINT METRES, or POINT unknown")
+        end = _end(point)
+        if all(end not in (stick.start, stick.end) for stick in sticks):
+            raise CalibrationError(
+                "an offset of a point that is no end of a stick", where="--stick-offset", got=repr(point),
+                expected="START or END of a --stick",
+            )  # fmt: skip
+        changes = [{"start_offset_m": offset_m} if end == s.start else {"end_offset_m": offset_m} for s in sticks]
+        sticks = [
+            replace(stick, **change) if end in (stick.start, stick.end) else stick
+            for stick, change in zip(sticks, changes, strict=True)
+        ]
+    return list(sticks)
+
+
+def _metres(text: str, where: str = "--stick", expected: str = "START END METRES, such as knob barrel 0.864") -> float:
     try:
         return float(text)
     except ValueError as error:
-        raise CalibrationError(
-            "not a length", where="--stick", got=repr(text), expected="START END METRES, such as knob barrel 0.864"
-        ) from error
+        raise CalibrationError("not a length", where=where, got=repr(text), expected=expected) from error
 
 
 def _provenance(options: argparse.Namespace, config: Config, notes: Sequence[str]) -> dict[str, Any]:

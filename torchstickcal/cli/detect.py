@@ -30,7 +30,7 @@ def session_in(paths: Sequence[Path], options: argparse.Namespace) -> Sequence[P
     from torchstickcal.errors import CalibrationError
 
     videos = [path for path in paths if path.suffix.lower() in VIDEO_SUFFIXES and not path.is_dir()]
-    asked = [f"--{name}" for name in ("weights", "rtmlib", "tape") if getattr(options, name) is not None]
+    asked = [f"--{name}" for name in ("weights", "rtmlib", "tape", "shaft") if getattr(options, name) not in (None, False)]
     if not videos and not asked:
         return paths
     if len(videos) < len(paths):
@@ -65,7 +65,7 @@ def found_in_videos(videos: Sequence[Path], folder: Path, options: argparse.Name
     settings = {"weights": None if options.weights is None else str(options.weights), "rtmlib": options.rtmlib}
     with progress(options) as bar:
         shown = _shown(bar, [path.stem for path in videos])
-        return detect(videos, folder, make_body, tapes, options.skeleton, shown, settings)
+        return detect(videos, folder, make_body, tapes, options.skeleton, shown, settings, options.shaft)
 
 
 def _shown(bar: Progress, cameras: list[str]) -> Callable[[str, int, int], None]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -45,7 +46,8 @@ def read_npz(path: str | Path) -> tuple[Observations, Truth | None]:
 
     It may hold:
 
-    - ``stick_sigma_m`` (S,), standard deviation of each stick's length, metres;
+    - ``stick_sigma_m`` (S,), standard deviation of each stick's length, metres; ``stick_offset_m`` (S, 2), offsets of start
+      and end, metres, NaN where they are not known;
     - ``confidence`` (C, F, P), from 0 to 1; ``distortion`` (C, D) in OpenCV's order; ``fisheye`` (), true or false;
       ``image_size`` (C, 2), width and height, pixels; ``intrinsics_known`` (), false where ``intrinsics`` is a guess;
     - ``fps`` (), frames per second; ``timestamps`` (C, F), seconds; ``known_readout_s`` (), read-out time of the rolling
@@ -138,7 +140,11 @@ def _sticks(arrays: Mapping[str, Any]) -> list[Stick]:
     columns = [arrays[name].tolist() for name in ("stick_start", "stick_end", "stick_length_m")]
     if "stick_sigma_m" in arrays:
         columns.append(arrays["stick_sigma_m"].tolist())
-    return [Stick(int(start), int(end), *map(float, lengths)) for start, end, *lengths in zip(*columns, strict=True)]
+    sticks = [Stick(int(start), int(end), *map(float, lengths)) for start, end, *lengths in zip(*columns, strict=True)]
+    if "stick_offset_m" not in arrays:
+        return sticks
+    offsets = [[None if np.isnan(own) else float(own) for own in pair] for pair in arrays["stick_offset_m"]]
+    return [replace(stick, start_offset_m=start, end_offset_m=end) for stick, (start, end) in zip(sticks, offsets, strict=True)]
 
 
 def _number(arrays: Mapping[str, Any], name: str) -> float | None:
@@ -157,12 +163,14 @@ def _truth(arrays: Mapping[str, Any]) -> Truth | None:
 
 def _arrays(observations: Observations) -> dict[str, Any]:
     sticks = observations.sticks
+    offsets = np.array([(s.start_offset_m, s.end_offset_m) for s in sticks], dtype=np.float64).reshape(-1, 2)
     optional = {name: getattr(observations, name) for name in _OPTIONAL_ARRAYS}
     values = {
         "fps": observations.fps,
         "names": observations.point_names,
         "camera_names": observations.camera_names,
         "known_readout_s": observations.readout_s,
+        "stick_offset_m": offsets if (offsets != 0).any() else None,
         "intrinsics_known": None if observations.intrinsics_known else False,
     }
     return {

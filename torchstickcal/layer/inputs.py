@@ -64,7 +64,7 @@ class LayerInputs:
         sessions, cameras, _, points, _ = keypoints.shape
         check_ends(sticks, points)
         if stick_lengths is None:
-            stick_lengths = [stick.length_m for stick in sticks]
+            stick_lengths = [stick.between_m for stick in sticks]
         lens = intrinsics if isinstance(intrinsics, Intrinsics) else Intrinsics(intrinsics)
         fisheye, distortion = truth_of(lens.fisheye, "fisheye"), None
         if lens.distortion is not None:

@@ -19,7 +19,7 @@ from torchstickcal.lazy import cached_property
 from torchstickcal.model.state import State
 from torchstickcal.model.unknowns import Columns, ImageMotion, RigUnknowns
 from torchstickcal.observations import Observations
-from torchstickcal.stick import point_index
+from torchstickcal.stick import point_index, scale_sticks
 from torchstickcal.workers import map_with_idle_workers
 
 _CHUNK_KEYPOINTS = {"cpu": 32_000, "cuda": 1_000_000}
@@ -71,7 +71,7 @@ class Measurements:
         visible = visible & (visible.sum(0) >= 2)
         keypoints = observations.keypoints.to(dtype)
         confidence = visible.to(dtype) if observations.confidence is None else observations.confidence.to(dtype)
-        sticks = [s for s in observations.sticks if use is None or set(s.ends) <= set(use)]
+        sticks = [s for s in scale_sticks(observations.sticks) if use is None or set(s.ends) <= set(use)]
         cameras = observations.cameras.batched()
         device = keypoints.device
         return Measurements(
@@ -80,7 +80,7 @@ class Measurements:
             cameras=cameras,
             frames=observations.num_frames,
             sticks=torch.tensor([s.ends for s in sticks], dtype=torch.long).view(-1, 2).to(device),
-            lengths_m=torch.tensor([[s.length_m for s in sticks]], dtype=torch.float64).to(device),
+            lengths_m=torch.tensor([[s.between_m for s in sticks]], dtype=torch.float64).to(device),
             stick_sigma_m=torch.tensor([s.sigma_m for s in sticks], dtype=torch.float64).to(device),
             unknowns=RigUnknowns.of((), cameras),
             point_names=observations.point_names,

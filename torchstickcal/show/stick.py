@@ -24,7 +24,7 @@ def stick_figure(calibration: Calibration) -> Figure:
     places = np.arange(len(calibration.points)) if times is None else times
     for number, stick in enumerate(calibration.sticks):
         axes = figure.add_subplot(count, 1, number + 1)
-        errors_mm = 1000 * (calibration.stick_lengths_m[:, number].detach().double().cpu().numpy() - stick.length_m)
+        errors_mm = 1000 * (calibration.stick_lengths_m[:, number].detach().double().cpu().numpy() - stick.between_m)
         known = np.isfinite(errors_mm)
         tolerance_mm = 1000 * stick.sigma_m
         axes.axhspan(-tolerance_mm, tolerance_mm, color=COLOURS["used"].light, alpha=0.12, linewidth=0, label="given ± std")

@@ -255,7 +255,7 @@ def stick_rows(found: Calibration | Reconstruction) -> list[tuple[str, ...]]:
         known = lengths[lengths.isfinite()]
         spread = f"{1000 * float(known.std()):.2f}" if len(known) > 1 else "-"
         mean = f"{float(known.mean()):.5f}" if len(known) else "-"
-        rows.append((stick_name(found, number), f"{stick.length_m:.5f}", mean, spread, str(len(known))))
+        rows.append((stick_name(found, number), f"{stick.between_m:.5f}", mean, spread, str(len(known))))
     return rows
 
 

@@ -6,6 +6,7 @@ with noise; the background is cluttered, also with things of the markers' colour
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -24,10 +25,14 @@ from torchstickcal.simulate.skeleton import JOINT_INDEX, JOINTS, PARENTS
 Array = NDArray[np.float64]
 Picture = NDArray[np.uint8]
 """(H, W, 3), blue, green, red"""
+Segment = tuple[Array, Array, float, tuple[int, int, int]]
+"""Start and end, metres; diameter, metres; colour."""
 
 MARKER_COLOURS = {"red": (30, 25, 215), "yellow": (25, 220, 235), "green": (40, 190, 30), "magenta": (200, 30, 220)}
 _LIMB_COLOURS = {"left": (120, 96, 70), "right": (110, 86, 64), "middle": (96, 90, 84), "skin": (140, 168, 205)}
 _STICK_COLOUR = (60, 60, 64)
+_PIECES = 8
+_CIRCLE = np.stack([np.cos(np.arange(24) * np.pi / 12), np.sin(np.arange(24) * np.pi / 12)], axis=-1)
 _BITS = 4
 _NOISES = 8
 _CLUTTER = 40
@@ -35,19 +40,21 @@ _CLUTTER = 40
 
 @dataclass(frozen=True)
 class Markers:
-    """Two pieces of tape around a stick.
+    """Two balls on a stick, or two pieces of tape around it.
 
     Args:
-        places_m: distances of their centres from the stick's start, metres; :func:`markers_of` has some for each sport.
+        places_m: distances of their centres from the stick's start, metres, as of :func:`markers_of`; empty for a bare stick.
         colours: keys of :data:`MARKER_COLOURS`.
-        length_m: of a piece along the stick, metres. diameter_m: of the tape. stick_m: diameter of the stick.
+        balls: whether they are balls. length_m: of a piece of tape along the stick, metres.
+        diameter_m: of ball or tape. stick_m: diameter of the stick.
     """
 
-    places_m: tuple[float, float]
+    places_m: tuple[float, ...]
     colours: tuple[str, str] = ("yellow", "red")
     length_m: float = 0.06
     diameter_m: float = 0.045
     stick_m: float = 0.022
+    balls: bool = False
 
     @property
     def apart_m(self) -> float:
@@ -58,7 +65,7 @@ class Markers:
         """Centres of the markers (..., 2, 3) on a stick whose start and end are the last two of points (..., P, 3)."""
         start, end = points[..., -2, :], points[..., -1, :]
         along = (end - start) / np.linalg.norm(end - start, axis=-1, keepdims=True)
-        return np.stack([start + place * along for place in self.places_m], axis=-2)
+        return start[..., None, :] + np.array(self.places_m)[:, None] * along[..., None, :]
 
 
 def markers_of(action: Action) -> Markers:
@@ -156,47 +163,49 @@ class CameraFilm:
 
     def _draw(self, picture: Picture, points: Array, corner: tuple[int, int]) -> None:
         """Draw a moment, farthest things first."""
-        start, end = points[-2], points[-1]
-        along = (end - start) / np.linalg.norm(end - start)
-        marked = self._markers.length_m / 2 * along
-        segments = [*_limbs(points), *((start + k / 8 * (end - start), start + (k + 1) / 8 * (end - start),
-                    self._markers.stick_m, _STICK_COLOUR) for k in range(8))]  # fmt: skip
-        colours = (MARKER_COLOURS[colour] for colour in self._markers.colours)
-        nearer = 0.03
-        centres = self._markers.on(points)
-        segments += [
-            (at - marked, at + marked, self._markers.diameter_m, colour) for at, colour in zip(centres, colours, strict=True)
-        ]
-        depths = [float(self._pixels((a + b)[None] / 2)[1][0]) for a, b, *_ in segments]
-        depths[-2:] = [depth - nearer for depth in depths[-2:]]
+        shapes = [(self._capsule, limb) for limb in _limbs(points)]
+        shapes += [(self._cylinder, piece) for piece in self._free_pieces(points[-2], points[-1])]
+        around = self._capsule if self._markers.balls else self._cylinder
+        shapes += [(around, marker) for marker in self._marked(points)]
+        depths = [float(self._pixels((first + second)[None] / 2)[1][0]) for _, (first, second, *_) in shapes]
         for number in np.argsort(depths)[::-1]:
-            first, second, diameter, colour = segments[int(number)]
-            self._capsule(picture, first, second, diameter, colour, corner)
+            outline, (first, second, diameter_m, colour) = shapes[int(number)]
+            edge = outline(np.stack([first, second]), diameter_m / 2) - corner
+            cv2.fillConvexPoly(picture, cv2.convexHull(_fixed(edge)), colour, cv2.LINE_AA, _BITS)
 
-    def _capsule(
-        self,
-        picture: Picture,
-        first: Array,
-        second: Array,
-        diameter_m: float,
-        colour: tuple[int, int, int],
-        corner: tuple[int, int],
-    ) -> None:
-        """A filled band between two points, with round ends unless it is a marker."""
-        pixels, depth = self._pixels(np.stack([first, second]))
-        pixels = pixels - corner
-        radius = 0.5 * self._matrix[0, 0] * diameter_m / depth
-        along = pixels[1] - pixels[0]
-        length = float(np.linalg.norm(along))
-        aside = np.array([-along[1], along[0]]) / max(length, 1e-9)
-        if length > 1e-6:
-            sides = pixels + radius[:, None] * aside, pixels - radius[:, None] * aside
-            outline = np.stack([sides[0][0], sides[0][1], sides[1][1], sides[1][0]])
-            cv2.fillConvexPoly(picture, _fixed(outline), colour, cv2.LINE_AA, _BITS)
-        if colour not in MARKER_COLOURS.values():
-            for at, r in zip(pixels, radius, strict=True):
-                centre = _fixed(at).tolist()
-                cv2.circle(picture, (centre[0], centre[1]), max(1, round(float(r) * 2**_BITS)), colour, -1, cv2.LINE_AA, _BITS)
+    def _marked(self, points: Array) -> list[Segment]:
+        """Bands around the stick, or balls: bands of no length with round ends."""
+        marks, along = self._markers, points[-1] - points[-2]
+        half = 0.0 if marks.balls else marks.length_m / 2 / float(np.linalg.norm(along))
+        return [
+            (centre - half * along, centre + half * along, marks.diameter_m, MARKER_COLOURS[colour])
+            for centre, colour in zip(marks.on(points), marks.colours, strict=False)
+        ]
+
+    def _free_pieces(self, start: Array, end: Array) -> list[Segment]:
+        """The stick between the markers, in pieces each of which is in front of or behind a limb as a whole."""
+        half = (self._markers.diameter_m if self._markers.balls else self._markers.length_m) / 2
+        length_m = float(np.linalg.norm(end - start))
+        free, pieces = [0.0], []
+        for place in sorted(self._markers.places_m):
+            free += [place - half, place + half]
+        free.append(length_m)
+        for low, high in zip(free[::2], free[1::2], strict=True):
+            steps = max(1, round(_PIECES * (high - low) / length_m))
+            places = start + np.linspace(low, high, steps + 1)[:, None] * (end - start) / length_m
+            pieces += [(a, b, self._markers.stick_m, _STICK_COLOUR) for a, b in itertools.pairwise(places) if high - low > 1e-6]
+        return pieces
+
+    def _capsule(self, ends: Array, radius_m: float) -> Array:
+        """Pixels (n, 2) whose convex hull is a limb with round ends (2, 3)."""
+        pixels, depth = self._pixels(ends)
+        radius = self._matrix[0, 0] * radius_m / depth
+        return (pixels[:, None] + radius[:, None, None] * _CIRCLE).reshape(-1, 2)
+
+    def _cylinder(self, ends: Array, radius_m: float) -> Array:
+        """Pixels (n, 2) whose convex hull is a cylinder with flat ends (2, 3)."""
+        aside = np.linalg.svd((ends[1] - ends[0])[None])[2][1:]
+        return self._pixels((ends[:, None] + radius_m * (_CIRCLE @ aside)).reshape(-1, 3))[0]
 
 
 def write_video(path: str | Path, pictures: Iterator[Picture], fps: float, codec: str = "mp4v") -> None:
@@ -222,8 +231,8 @@ def _fixed(pixels: Array) -> NDArray[np.int32]:
     return np.round(np.clip(pixels, -5000, 20000) * 2**_BITS).astype(np.int32)
 
 
-def _limbs(points: Array) -> list[tuple[Array, Array, float, tuple[int, int, int]]]:
-    """Start, end, diameter (m) and colour of each limb."""
+def _limbs(points: Array) -> list[Segment]:
+    """The limbs of a body."""
     limbs = []
     for joint, parent in PARENTS.items():
         side, _, name = joint.rpartition("_")

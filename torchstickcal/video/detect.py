@@ -25,7 +25,8 @@ from torchstickcal.io.skeletons import skeletons_of
 from torchstickcal.untrusted import read_json
 from torchstickcal.video.frames import frame_numbers, frames_at, frames_of, video_info
 from torchstickcal.video.pose import BodyDetector
-from torchstickcal.video.tape import TapeTrack, candidates, check_colours, learned, sampled
+from torchstickcal.video.shaft import SHAFT_POINTS, shaft_in, shaft_track
+from torchstickcal.video.tape import Background, TapeTrack, candidates, check_colours, ends_of, learned, sampled
 
 Array = NDArray[np.float64]
 Progress = Callable[[str, int, int], None]
@@ -62,8 +63,9 @@ def detect_video(
     tapes: Sequence[str] = (),
     skeleton: str | None = None,
     progress: Progress | None = None,
+    shaft: bool = False,
 ) -> VideoKeypoints:
-    """Find the athlete's keypoints and the marked ends of the stick in a video.
+    """Find the athlete's keypoints and the stick in a video.
 
     Args:
         path: of the video.
@@ -73,12 +75,17 @@ def detect_video(
             The points are called ``tape_red`` and so on. The camera must stand still.
         skeleton: the names of the body's points; None to know it by their number.
         progress: called after every frame.
+        shaft: whether to look for a stick without marks, as a line from the hands. The points are called ``shaft_hands`` and
+            ``shaft_end``. The camera must stand still.
 
     Raises:
-        CalibrationError: if there is nothing to look for, or the skeleton is not known.
+        CalibrationError: if there is nothing to look for, the skeleton is not known, or a shaft is to be found without the
+            wrists.
         FileFormatError: if the file is no video, or damaged.
         FileNotFoundError: if there is no such file.
     """
+    if shaft and body is None:
+        raise _no_wrists(path, "no body keypoints")
     if body is None and not tapes:
         raise CalibrationError(
             "nothing to look for in a video", where=str(path), got="neither weights nor tape", expected="one of them, or both"
@@ -97,8 +104,12 @@ def detect_video(
     names = _names(len(people[0]), skeleton) if people else ()
     numbers, fps = frame_numbers(np.array(times))
     parts = [np.stack(people)] if people else []
-    parts += [ends[:, None] for ends in _tape_ends(path, len(times), tapes, people, names)]
     points = (*names, *(f"tape_{name}" for name in tapes))
+    if tapes or shaft:
+        background = _background(path, tapes, people, len(times))
+        parts += [ends[:, None] for ends in _tape_ends(path, background, tapes, people, names)]
+        parts += [_shaft(path, background, people, names)] if shaft else []
+        points += SHAFT_POINTS if shaft else ()
     return VideoKeypoints(camera, numbers, np.array(times), fps, info.size, points, np.concatenate(parts, axis=1))
 
 
@@ -110,6 +121,7 @@ def detect(
     skeleton: str | None = None,
     progress: Progress | None = None,
     settings: dict[str, Any] | None = None,
+    shaft: bool = False,
 ) -> list[str]:
     """Find keypoints in the videos of a rig and write the folder of a session. Videos that were done before are not read again.
 
@@ -117,7 +129,7 @@ def detect(
         paths: of the videos, one for each camera; a camera has the name of its file.
         out: the folder.
         make_body: makes a detector for each video; None for none.
-        tapes, skeleton, progress: as of :func:`detect_video`.
+        tapes, skeleton, progress, shaft: as of :func:`detect_video`.
         settings: what else the results depend on; videos that were done with others are read again.
 
     Returns:
@@ -136,11 +148,12 @@ def detect(
     notes = []
     for path, camera in zip(paths, cameras, strict=True):
         made_of = {"file": str(path), "bytes": Path(path).stat().st_size if Path(path).is_file() else None}
-        made_of |= {"tapes": list(tapes), "skeleton": skeleton, "body": make_body is not None, **(settings or {})}
+        made_of |= {"tapes": list(tapes), "skeleton": skeleton, "body": make_body is not None, "shaft": shaft}
+        made_of |= settings or {}
         if _is_done(out, camera, made_of):
             notes.append(f"{camera}: done before.")
             continue
-        found = detect_video(path, camera, None if make_body is None else make_body(), tapes, skeleton, progress)
+        found = detect_video(path, camera, None if make_body is None else make_body(), tapes, skeleton, progress, shaft)
         with atomic_set(out / "cameras") as folder:
             _write_table(folder / f"{camera}.csv", found)
             content = {"made_of": made_of, "fps": found.fps, "image_size": found.size, "frames": len(found.frames)}
@@ -151,21 +164,43 @@ def detect(
     return notes
 
 
+def _background(path: str | Path, tapes: Sequence[str], people: Sequence[Array], frames: int) -> Background:
+    chosen = sampled(frames)
+    return learned(frames_at(path, set(chosen)), tapes, [people[number] for number in chosen] if people else ())
+
+
 def _tape_ends(
-    path: str | Path, frames: int, tapes: Sequence[str], people: Sequence[Array], names: Sequence[str]
+    path: str | Path, background: Background, tapes: Sequence[str], people: Sequence[Array], names: Sequence[str]
 ) -> list[Array]:
     """The marked ends (F, 3) of each colour."""
     if not tapes:
         return []
-    chosen = sampled(frames)
-    background = learned(frames_at(path, set(chosen)), tapes, [people[number] for number in chosen] if people else ())
     tracks = [TapeTrack() for _ in tapes]
     for frame, (_, image) in enumerate(frames_of(path)):
         for number, (name, track) in enumerate(zip(tapes, tracks, strict=True)):
             reach = _HAND_REACH if number == 0 else _STICK_REACH
             near = _near_hands(people[frame], names, reach) if people else None
             track.add(candidates(image, background, name, near), near)
-    return [track.ends() for track in tracks]
+    return ends_of(tracks)
+
+
+def _shaft(path: str | Path, background: Background, people: Sequence[Array], names: Sequence[str]) -> Array:
+    """The shaft (F, 2, 3) in each frame, by the hands."""
+    if not {"left_wrist", "right_wrist"} & set(names):
+        raise _no_wrists(path, "no point left_wrist or right_wrist")
+    found = []
+    for person, (_, image) in zip(people, frames_of(path), strict=True):
+        near = _near_hands(person, names, 1.0)
+        nothing = np.full((len(SHAFT_POINTS), 3), [np.nan, np.nan, 0.0])
+        found.append(nothing if near is None else shaft_in(image, background.image, near[:2], near[2]))
+    return shaft_track(found)
+
+
+def _no_wrists(path: str | Path, got: str) -> CalibrationError:
+    return CalibrationError(
+        "a shaft is found from the hands on, and the hands are not known", where=str(path), got=got,
+        expected="body keypoints with the wrists", remedy="Give --weights or --rtmlib, and the --skeleton if it is not known.",
+    )  # fmt: skip
 
 
 def _names(points: int, skeleton: str | None) -> tuple[str, ...]:
@@ -198,7 +233,7 @@ def _about(found: VideoKeypoints) -> str:
     text = f"{found.camera}: {len(found.frames)} frames, {found.fps:.3f} Hz"
     text += f", {dropped} dropped" if dropped else ""
     for number, name in enumerate(found.points):
-        if name.startswith("tape_"):
+        if name.startswith(("tape_", SHAFT_POINTS[-1])):
             text += f", {name} in {100 * _share_seen(found, number):.0f} %"
     return f"{text}."
 

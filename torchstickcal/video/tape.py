@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from torchstickcal.errors import CalibrationError
 from torchstickcal.registry import suggestion
 from torchstickcal.video.frames import Image
+from torchstickcal.video.patch import Patch
 
 Array = NDArray[np.float64]
 
@@ -31,6 +32,8 @@ _LEAST_SHARE = 0.12
 """Share of a pixel's exposure from which it belongs to a marker."""
 _LEAST_CHANGE = 14.0
 """Difference from the background that is not noise, in steps of 256."""
+_OTHER_CHANGE = 30.0
+"""Difference from the background of another thing; compression leaves smaller ones around a marker."""
 _UNEXPLAINED = 0.35
 """Largest part of a pixel's change, as a share of it, that mixing with the marker's colour does not explain."""
 _LEAST_CONTRAST = 40.0
@@ -43,6 +46,7 @@ _AREA_FRAMES = 6
 _LEAST_SCORE = 0.02
 _RIVAL = 0.4
 """A second thing of that colour, of this share of the area of the first one, makes a frame ambiguous."""
+_NO_DIRECTION_PX = 3.0
 _NEIGHBOURS = 4
 _JUMP_PX = 6.0
 _JUMP_SHARE = 0.35
@@ -61,6 +65,8 @@ class Candidate:
     area_px: float
     streak_px: float
     """length of the streak"""
+    patch: Patch | None = None
+    """its pixels"""
 
 
 @dataclass(frozen=True, eq=False)
@@ -158,25 +164,24 @@ def candidates(
     colour = background.colours[name]
     if colour is None:
         return []
-    shares, unknown, corner = _shares(image, background.image, colour, near)
+    shares, other, unknown, corner = _shares(image, background.image, colour, near)
     _, labels, boxes, _ = cv2.connectedComponentsWithStats((shares > _LEAST_SHARE).astype(np.uint8), connectivity=8)
     found = []
     for label, (left, top, width, height, pixels) in enumerate(boxes[1:].tolist(), 1):
         if pixels < _LEAST_AREA_PX / 2:
             continue
-        part = slice(max(0, top - 1), top + height + 1), slice(max(0, left - 1), left + width + 1)
+        part = slice(max(0, top - 3), top + height + 3), slice(max(0, left - 3), left + width + 3)
         own = np.where(labels[part] == label, shares[part], 0.0)
-        found += _markers_in(own, unknown[part], (part[1].start, part[0].start))
-    whole = [Candidate(c.x + corner[0], c.y + corner[1], c.area_px, c.streak_px) for c in found]
-    inside = [c for c in whole if _is_inside(c, image.shape)]
+        found += _markers_in(own, other[part], unknown[part], (corner[0] + part[1].start, corner[1] + part[0].start))
+    inside = [c for c in found if _is_inside(c, image.shape)]
     return sorted(inside, key=lambda candidate: -candidate.area_px)
 
 
 def _shares(
     image: Image, background: NDArray[np.float32], colour: NDArray[np.float32], near: tuple[float, float, float] | None
-) -> tuple[NDArray[np.float32], NDArray[np.bool_], tuple[int, int]]:
-    """Of a part of an image: shares of a marker in its pixels (h, w), 0 where another thing explains them; where the background
-    is not known, (h, w); and the corner of the part.
+) -> tuple[NDArray[np.float32], NDArray[np.bool_], NDArray[np.bool_], tuple[int, int]]:
+    """Of a part of an image: shares of a marker in its pixels (h, w), 0 where another thing explains them; where another thing
+    is seen, (h, w); where the background is not known, (h, w); and the corner of the part.
     """
     left, top, right, bottom = 0, 0, image.shape[1], image.shape[0]
     if near is not None:
@@ -184,7 +189,7 @@ def _shares(
         left, top = max(0, int(x - radius)), max(0, int(y - radius))
         right, bottom = min(right, int(x + radius) + 1), min(bottom, int(y + radius) + 1)
     if right - left < 3 or bottom - top < 3:
-        return np.zeros((1, 1), np.float32), np.zeros((1, 1), bool), (0, 0)
+        return np.zeros((1, 1), np.float32), np.zeros((1, 1), bool), np.zeros((1, 1), bool), (0, 0)
     part, behind = image[top:bottom, left:right], background[top:bottom, left:right]
     apart = cv2.absdiff(part, np.nan_to_num(behind).round().astype(np.uint8)).max(-1)
     unknown = np.isnan(behind[..., 0])
@@ -197,10 +202,15 @@ def _shares(
     fits = (length > _LEAST_CHANGE) & (rest < _UNEXPLAINED * length + _LEAST_CHANGE / 2) & (size > _LEAST_CONTRAST**2)
     shares = np.zeros(part.shape[:2], np.float32)
     shares[rows, columns] = np.where(fits, share, 0.0).clip(0, 1)
-    return shares, unknown, (left, top)
+    other = unknown.copy()
+    other[rows, columns] = (length > _OTHER_CHANGE) & ~fits
+    things = cv2.morphologyEx(other.astype(np.uint8), cv2.MORPH_OPEN, np.ones((2, 2), np.uint8)) > 0
+    return shares, things, unknown, (left, top)
 
 
-def _markers_in(shares: NDArray[np.float32], unknown: NDArray[np.bool_], corner: tuple[int, int]) -> list[Candidate]:
+def _markers_in(
+    shares: NDArray[np.float32], other: NDArray[np.bool_], unknown: NDArray[np.bool_], corner: tuple[int, int]
+) -> list[Candidate]:
     """Markers in connected pixels with shares (h, w): what is half as pure as the purest pixels belongs together.
 
     A marker at rest covers pixels wholly. One that is blurred covers each of them for a shorter time the longer its streak is.
@@ -214,8 +224,9 @@ def _markers_in(shares: NDArray[np.float32], unknown: NDArray[np.bool_], corner:
         own = cv2.dilate((labels == label).astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
         if (own & unknown).any():
             continue
-        rows, columns = np.nonzero(own & ((labels == 0) | (labels == label)) & (shares > 0))
-        weights = shares[rows, columns].astype(np.float64)
+        mine = np.where(own & ((labels == 0) | (labels == label)), shares, np.float32(0))
+        rows, columns = np.nonzero(mine)
+        weights = mine[rows, columns].astype(np.float64)
         area = float(weights.sum())
         if area < _LEAST_AREA_PX:
             continue
@@ -223,13 +234,13 @@ def _markers_in(shares: NDArray[np.float32], unknown: NDArray[np.bool_], corner:
         spread = np.cov(np.stack([columns, rows]), aweights=weights)
         width, length = np.sqrt(12 * np.maximum(np.linalg.eigvalsh(spread), 0.0)) + 1e-9
         if peak >= _PURITY * min(1.0, width / max(length - width, 1e-9)):
-            found.append(Candidate(x + corner[0], y + corner[1], area, float(length)))
+            found.append(Candidate(x + corner[0], y + corner[1], area, float(length), Patch(mine, other, corner)))
     return found
 
 
 @dataclass(eq=False)
 class TapeTrack:
-    """The candidates of one marker over a video, of which :meth:`ends` selects those that are sure."""
+    """The candidates of one marker over a video, of which :meth:`chosen` selects those that are sure."""
 
     found: list[list[Candidate]] = field(default_factory=list)
     """of each frame"""
@@ -241,21 +252,53 @@ class TapeTrack:
         self.found.append(candidates)
         self.near.append(near)
 
-    def ends(self) -> Array:
-        """(F, 3): x and y in pixels, and a score; NaN, NaN, 0 where no end is sure.
-
-        The score is lower where the marker is seen along the stick: its area is small, and the stick itself hides a part of it.
-        """
+    def chosen(self) -> list[Candidate | None]:
+        """The one candidate in each frame that is the marker; None where that is not sure."""
         allowed = [[c for c in found if _within(c, near)] for found, near in zip(self.found, self.near, strict=True)]
-        usual = _usual_areas(allowed)
-        ends = np.full((len(allowed), 3), [np.nan, np.nan, 0.0])
-        whole = float(np.nanpercentile(usual, 90)) if np.isfinite(usual).any() else np.nan
-        for frame, (found, area) in enumerate(zip(allowed, usual, strict=True)):
+        chosen: list[Candidate | None] = []
+        for found, area in zip(allowed, _usual_areas(allowed), strict=True):
             fitting = [c for c in found if _AREA_RANGE[0] * area <= c.area_px <= _AREA_RANGE[1] * area]
-            if len(fitting) == 1 and not any(c.area_px >= _RIVAL * area for c in found if c is not fitting[0]):
-                score = np.clip((fitting[0].area_px / whole) ** 2, _LEAST_SCORE, 1.0)
-                ends[frame] = fitting[0].x, fitting[0].y, score
-        return _without_jumps(ends)
+            alone = len(fitting) == 1 and not any(c.area_px >= _RIVAL * area for c in found if c is not fitting[0])
+            chosen.append(fitting[0] if alone else None)
+        follow = without_jumps(np.array([(c.x, c.y) if c else (np.nan, np.nan) for c in chosen]).reshape(-1, 2))
+        return [c if sure else None for c, sure in zip(chosen, np.isfinite(follow[:, 0]), strict=True)]
+
+
+def ends_of(tracks: Sequence[TapeTrack]) -> list[Array]:
+    """Of the marker of each track (F, 3): x and y in pixels, and a score; NaN, NaN, 0 where no end is sure.
+
+    The direction of the stick is that from one marker to the other, or from the hands to the last marker. The score is lower
+    where a marker is seen along the stick, or where that direction is not known: the stick itself may hide a part of it.
+    """
+    chosen = [track.chosen() for track in tracks]
+    ends = [np.full((len(track.found), 3), [np.nan, np.nan, 0.0]) for track in tracks]
+    for number, (track, own) in enumerate(zip(tracks, chosen, strict=True)):
+        areas = [c.area_px for c in own if c is not None]
+        whole = float(np.percentile(areas, 90)) if areas else np.nan
+        for frame, candidate in enumerate(own):
+            if candidate is None:
+                continue
+            others = [c[frame] for k, c in enumerate(chosen) if k != number]
+            axis = _axis(candidate, others, track.near[frame] if number == len(tracks) - 1 else None)
+            centre: Array | None = np.array([candidate.x, candidate.y])
+            score = np.clip((candidate.area_px / whole) ** 2, _LEAST_SCORE, 1.0)
+            if candidate.patch is not None and axis is not None:
+                centre = candidate.patch.centre_on(axis)
+            elif others:
+                score = _LEAST_SCORE
+            if centre is not None:
+                ends[number][frame] = *centre, score
+    return ends
+
+
+def _axis(candidate: Candidate, others: Sequence[Candidate | None], hands: tuple[float, float, float] | None) -> Array | None:
+    """The direction (2,) of the stick at a marker, by another marker or by the hands; None where neither is known."""
+    places = [(other.x, other.y) for other in others if other is not None] + ([] if hands is None else [hands[:2]])
+    for place in places:
+        apart = np.array([candidate.x, candidate.y]) - place
+        if np.linalg.norm(apart) > _NO_DIRECTION_PX:
+            return apart
+    return None
 
 
 def _of_hue(image: Image, name: str) -> NDArray[np.bool_]:
@@ -290,14 +333,14 @@ def _usual_areas(found: list[list[Candidate]]) -> Array:
     return usual
 
 
-def _without_jumps(ends: Array) -> Array:
-    """Ends (F, 3) without those that do not follow from their neighbours, the most surprising of neighbours first."""
+def without_jumps(ends: Array) -> Array:
+    """Ends (F, 2) without those that do not follow from their neighbours, the most surprising of neighbours first."""
     kept = ends.copy()
     surprise = np.array([_surprise(kept, frame) for frame in range(len(kept))])
     while (surprise > 1).any():
         around = [surprise[max(0, k - _NEIGHBOURS) : k + _NEIGHBOURS + 1].max() for k in range(len(kept))]
         worst = np.flatnonzero((surprise > 1) & (surprise == around))
-        kept[worst] = np.nan, np.nan, 0.0
+        kept[worst] = np.nan
         for frame in {n for k in worst for n in range(max(0, k - _NEIGHBOURS), min(len(kept), k + _NEIGHBOURS + 1))}:
             surprise[frame] = _surprise(kept, frame)
     return kept

@@ -28,6 +28,7 @@ def sticks(evidence: Evidence) -> Iterator[Finding]:
     if len(evidence.measurements.sticks) > 1:
         yield from _contradicted(evidence)
     yield from _scale(evidence)
+    yield from _offsets(evidence)
     yield from _ends(evidence)
     yield from _lengths(evidence)
 
@@ -48,7 +49,8 @@ def _contradicted(evidence: Evidence) -> Iterator[Finding]:
                 "stick_lengths_contradict",
                 Severity.SERIOUS,
                 f"The stick {' - '.join(names)} is {length:.4g} m long by the keypoints, but {given:.4g} m was given.",
-                "Check the lengths of all sticks, and which points are their ends.",
+                "Check the lengths of all sticks, and which points are their ends. If a point lies inside the end of its "
+                "stick, as a grip that the hands hide, give its offset, or say that it is unknown (--stick-offset).",
                 points=names,
                 figure=abs(length - given),
                 limit=limit,
@@ -93,6 +95,44 @@ def _scale(evidence: Evidence) -> Iterator[Finding]:
             figure=std,
             limit=_UNKNOWN_SCALE if unknown else _IMPRECISE_SCALE,
             unit="share",
+        )
+
+
+def _offsets(evidence: Evidence) -> Iterator[Finding]:
+    """Ends that are detected inside their stick by an unknown distance: what it is, or that nothing tells."""
+    observations = evidence.observations
+    known = any(stick.unknown_end is None for stick in observations.sticks)
+    for stick in observations.sticks:
+        if not isinstance(stick.unknown_end, int):
+            continue
+        name = evidence.point(stick.unknown_end)
+        if not known:
+            yield Finding(
+                "stick_offset_undetermined",
+                Severity.SERIOUS,
+                f"How far {name} lies inside the end of its stick is not known, and no other length is: the offset and the "
+                "length are one number, the scale. The offset is taken for 0. Each centimetre of it makes all distances "
+                f"{1 / stick.between_m:.2g} % too long.",
+                "Give a second length: a mark on the stick and its distance from the other end, or another stick.",
+                points=(name,),
+            )
+            continue
+        start, end = evidence.points[..., list(stick.ends)].unbind(-1)
+        lengths = (end - start).norm(dim=0)
+        lengths = lengths[lengths.isfinite()]
+        if len(lengths) < 2:
+            continue
+        offset = stick.between_m - float(lengths.median())
+        variance = (evidence.scale_std * stick.between_m) ** 2 + stick.sigma_m**2 + float(lengths.var()) / len(lengths)
+        yield Finding(
+            "stick_offset",
+            Severity.NOTE,
+            f"{name} is detected {offset:.4f} m inside the end of its stick, with a standard deviation of "
+            f"{variance**0.5:.4f} m.",
+            f"Give this offset for recordings of this stick alone (--stick-offset {name} {offset:.4f}).",
+            points=(name,),
+            figure=offset,
+            unit="m",
         )
 
 

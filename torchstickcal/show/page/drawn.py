@@ -289,13 +289,13 @@ def _lengths(drawing: Drawing, number: int) -> dict[str, Any]:
     """One stick's reconstructed lengths minus the given one, metres: least, median and largest of each place of the curve."""
     c = drawing.calibration
     stick = c.sticks[number]
-    errors = c.stick_lengths_m[:, number].detach().double().cpu() - stick.length_m
+    errors = c.stick_lengths_m[:, number].detach().double().cpu() - stick.between_m
     parts = _bucketed(errors)
     known = parts.isfinite()
     missing = ~errors.isfinite()
     return {
         "name": stick_name(c, number),
-        "given_m": stick.length_m,
+        "given_m": stick.between_m,
         "sigma_m": stick.sigma_m,
         "median": packed(parts.nanmedian(-1).values),
         "least": packed(parts.where(known, torch.inf).amin(-1)),
