@@ -147,7 +147,7 @@ def test_a_point_seen_once_is_nan_and_counted(noisy):
     keypoints[0, 5, 3] = 100.0
     calibration = calibrate(dataclasses.replace(observations, keypoints=keypoints))
     assert calibration.points[5, 3].isnan().all()
-    assert any("were not used" in warning for warning in calibration.warnings)
+    assert any("no second camera saw the point" in warning for warning in calibration.warnings)
 
 
 def test_confidence_weighs_keypoints():

@@ -129,7 +129,7 @@ def test_a_batch_gives_what_its_sessions_give_and_a_failure_keeps_its_lenses():
     assert together.distortion is not None
     torch.testing.assert_close(together.intrinsics[1], matrix[1], rtol=0, atol=0)
     assert (together.distortion[1] == 0).all()
-    found = torch.autograd.grad(sum(sum(readouts(session(together, k))) for k in range(3)), (keypoints, matrix))
+    found = torch.autograd.grad(sum(sum(readouts(together[k])) for k in range(3)), (keypoints, matrix))
     assert (found[0][1] == 0).all()
     assert (found[1][1] == 0).all()
     for k in (0, 2):
@@ -139,11 +139,6 @@ def test_a_batch_gives_what_its_sessions_give_and_a_failure_keeps_its_lenses():
             torch.testing.assert_close(getattr(together, name)[k], getattr(alone, name), rtol=1e-8, atol=1e-8)
         for of_batch, expected in zip(found, torch.autograd.grad(sum(readouts(alone)), one), strict=True):
             torch.testing.assert_close(of_batch[k], expected, rtol=1e-6, atol=1e-6, equal_nan=True)
-
-
-def session(result: LayerResult, k: int) -> LayerResult:
-    values = {name: getattr(result, name)[k] for name in vars(result) if name != "status"}
-    return LayerResult(**values, status=result.status[k : k + 1])
 
 
 def test_a_warm_start_leads_to_the_same_place_from_the_lenses_found():

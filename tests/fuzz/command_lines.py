@@ -91,6 +91,8 @@ VALUES: dict[str, list[str] | None] = {
     "--up": ["0 0 1", "0 0 0", "nan 0 1", "x y z"],
     "--from": ["pose2sim", "x", ""],
     "--tape": ["red,yellow", "x", ","],
+    "--shaft": None,
+    "--stick-offset": ["0 0.1", "left_wrist unknown", "0 unknown", "x 1", "0 nan", "0"],
     "--weights": _PATHS,
     "--rtmlib": ["x", ""],
     "--cluster": ["x", ""],
@@ -151,7 +153,7 @@ FITTING = {
         *("--format", "--export", "--config", "--refine", "--no-sync", "--stick-length", "--stick-sigma", "--plugin"),
         *("--stick", "--stick-points", "--intrinsics", "--image-size", "--fps", "--skeleton", "--person"),
         *("--write", "--world", "--initial", "--turned", "--split-moved", "--strict", "--verbose", "--rrd"),
-        *("--set", "--print-config", "--height", "--quiet"),
+        *("--set", "--print-config", "--height", "--quiet", "--stick-offset"),
     ],
     "evaluate": ["--format", "--json", "--plugin", "--units"],
     "simulate": ["--seed", "--plugin"],
@@ -164,7 +166,7 @@ FITTING = {
     "sample": [],
     "report": ["--rrd"],
     "analyse": ["--sport", "--up", "--fps"],
-    "detect": ["--tape", "--weights", "--rtmlib"],
+    "detect": ["--tape", "--shaft", "--weights", "--rtmlib"],
 }
 """The options that a command takes, apart from those that it needs."""
 
