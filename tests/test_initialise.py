@@ -170,3 +170,15 @@ def test_a_start_with_reversed_depths_is_left(seed: int):
     found, truth = ended.state, case.truth
     errors = metrics.pose_errors(found.rotations[0], found.translations[0], truth.rotations, truth.translations)
     assert errors.mean_rotation_deg < 10  # on the wrong side it is more than 90
+
+
+@pytest.mark.filterwarnings("ignore::torchstickcal.ObservationWarning")
+@pytest.mark.parametrize("place", [(0.0, 0.0), (-1.0, -1.0), (960.0, 540.0)])
+def test_keypoints_that_never_move_do_not_start_the_rig(place: tuple[float, float]):
+    session = SessionSpec("stuck", "kendo", seed=71, cameras=3, frames=40, regimes=(Noise(2.0),)).generate()
+    keypoints = session.observations.keypoints.clone()
+    keypoints[1, :, ::3] = torch.tensor(place, dtype=torch.float64)
+    found = calibrate(replace(session.observations, keypoints=keypoints))
+    truth = session.truth
+    found_errors = metrics.pose_errors(found.rotations, found.translations, truth.rotations, truth.translations)
+    assert found_errors.mean_translation_m < 0.03

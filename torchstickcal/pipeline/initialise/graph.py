@@ -107,8 +107,9 @@ def propagate(edges: Sequence[Edge], views: Views, scale: float) -> tuple[Array,
     among them: the twisted pair can have as many. A third camera decides, because the wrong pose projects the points elsewhere
     in it. So the cameras are placed once for every plausible pose of the first edge. At each further edge, the pose with the
     largest support by the points known so far is used. Of these rigs, the one with the largest total support is kept. Where the
-    points of the others contradict a camera, all is done with steady keypoints alone, and each camera that is contradicted then
-    is placed again. A few hundred points, evenly spaced in the session, are sufficient.
+    points of the others contradict a camera, all is also done with steady keypoints alone, each camera that is contradicted is
+    placed again, and the rig is kept on which more keypoints agree. A few hundred points, evenly spaced in the session, are
+    sufficient.
 
     Args:
         edges: the spanning tree.
@@ -121,17 +122,23 @@ def propagate(edges: Sequence[Edge], views: Views, scale: float) -> tuple[Array,
     first = edges[0].poses
     plausible = [pose for pose in first if pose.in_front >= _PLAUSIBLE_SHARE * first[0].in_front]
 
-    def placed() -> tuple[Array, Array]:
-        rigs = [_place_cameras(root, edges, rays, visible, scale) for root in plausible]
+    def placed(used: NDArray[np.bool_]) -> tuple[Array, Array]:
+        rigs = [_place_cameras(root, edges, rays, used, scale) for root in plausible]
         return max(rigs, key=lambda rig: rig[0])[1:]
 
-    rotations, translations = placed()
+    def support(rig: tuple[Array, Array]) -> float:
+        rotations, translations = rig
+        return sum(_supported(camera, rotations, translations, rays, visible, scale).share for camera in range(len(rays)))
+
+    rotations, translations = placed(visible)
     if _doubtful(rotations, translations, rays, visible, scale):
         steady = visible & views.steady[:, columns]
-        if steady.sum(1).min() >= _MIN_POINTS:
-            visible = steady
-            rotations, translations = placed()
-        _place_again(rotations, translations, rays, visible, scale)
+        rigs: list[tuple[Array, Array]] = []
+        for used in (steady, visible) if steady.sum(1).min() >= _MIN_POINTS else (visible,):
+            rotations, translations = placed(used)
+            _place_again(rotations, translations, rays, used, scale)
+            rigs.append((rotations, translations))
+        rotations, translations = max(rigs, key=support)
     from_first = rotations @ rotations[0].T
     from_first[0] = np.eye(3)
     return from_first, translations - from_first @ translations[0]

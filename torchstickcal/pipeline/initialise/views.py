@@ -44,13 +44,15 @@ class Views:
     def steady(self) -> NDArray[np.bool_]:
         """Keypoints (C, N) near those of the same point in the same camera one or two frames before or after.
 
-        Of wrong keypoints only those are that are wrong in the same way for several frames.
+        Of wrong keypoints only those are that are wrong in the same way for several frames. Keypoints at exactly the same place
+        as before are not: so are marks of what is missing, and detectors that have stopped.
         """
         m = self._measurements
         pixels = m.by_frame(m.pixels[0].double()).where(m.by_frame(m.visible[0])[:, None], torch.nan).cpu().numpy()
         nearest = np.full_like(pixels[:, 0], np.inf)
         for step in range(1, _NEIGHBOURS + 1):
             apart = np.hypot(*np.moveaxis(pixels[:, :, step:] - pixels[:, :, :-step], 1, 0))
+            apart[apart == 0] = np.inf
             for own in (nearest[:, step:], nearest[:, :-step]):
                 np.fmin(own, apart, out=own)
         nearest = nearest.reshape(len(nearest), -1)
