@@ -172,7 +172,7 @@ def test_a_start_with_reversed_depths_is_left(seed: int):
     assert errors.mean_rotation_deg < 10  # on the wrong side it is more than 90
 
 
-@pytest.mark.filterwarnings("ignore::torchstickcal.ObservationWarning")
+@pytest.mark.filterwarnings("ignore::torchstickcal.errors.ObservationWarning")
 @pytest.mark.parametrize("place", [(0.0, 0.0), (-1.0, -1.0), (960.0, 540.0)])
 def test_keypoints_that_never_move_do_not_start_the_rig(place: tuple[float, float]):
     session = SessionSpec("stuck", "kendo", seed=71, cameras=3, frames=40, regimes=(Noise(2.0),)).generate()
