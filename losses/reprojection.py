@@ -159,7 +159,7 @@ class ReprojectionLoss(CameraPointLoss):
         gradient = at.a * wx.unsqueeze(-2)
         by_unknowns = None
         if unknowns is not None:
-            ex, ey = unknowns.projection_derivatives(at.u, at.v, at.pixel)
+            ex, ey = (derivative.to(wx) for derivative in unknowns.projection_derivatives(at.u, at.v, at.pixel))
             by_unknowns = (ex @ wx.unsqueeze(-1) + ey @ wy.unsqueeze(-1))[..., 0]
         return CameraPointSlopes(
             cost=self.total(at.squared, over=2),

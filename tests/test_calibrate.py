@@ -99,6 +99,18 @@ def test_results_have_the_callers_dtype_and_accuracy(noisy):
     torch.testing.assert_close(calibration.translations.double(), calibrate(observations).translations, rtol=0, atol=2e-4)
 
 
+@pytest.mark.parametrize("refine", [["focal", "radial"], ["principal_point"], ["time_offset", "readout"]])
+def test_float32_precision_knows_lenses_and_clocks(noisy, refine: list[str]):
+    observations = dataclasses.replace(noisy[0], image_size=(1920, 1080))
+    exact, rounded = (
+        calibrate(observations, {"extends": "default", "refine": refine, "precision": p}) for p in ("float64", "float32")
+    )
+    assert rounded.converged
+    for name in refine:
+        off = (rounded.unknowns[name].value - exact.unknowns[name].value).abs()
+        assert bool((off <= 0.05 * exact.unknowns[name].std + 1e-6).all())
+
+
 @pytest.mark.parametrize("config", ["default", "paper"])
 def test_float32_precision_costs_nothing_against_the_noise(noisy, config: str):
     observations, truth = noisy
