@@ -16,11 +16,11 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
+from statistics_of_the_calibration import deviation, true_poses
 
-from torchstickcal import Calibration, CalibrationError, ObservationError, calibrate
+from torchstickcal import CalibrationError, ObservationError, calibrate
 from torchstickcal.benchmark.bound import camera_bound
 from torchstickcal.benchmark.cases import Case
-from torchstickcal.io import Truth
 from torchstickcal.metrics import pose_errors
 from torchstickcal.simulate import Lens, SessionSpec
 from torchstickcal.simulate.regimes import DetectorNoise, Flips, Gaps, Outliers, Regime, SelfOcclusion, SwappedEnds, Views
@@ -167,19 +167,9 @@ def outcome(number: int, name: str, seed: int) -> Outcome:
     except CalibrationError:
         return Outcome(float("nan"), bound_m, float("nan"))
     errors = pose_errors(found.rotations, found.translations, given.truth.rotations, given.truth.translations)
-    return Outcome(errors.mean_translation_m, bound_m, squared_error(found, given.truth))
-
-
-def squared_error(found: Calibration, truth: Truth) -> float:
-    """Squared error of the tangents of all cameras but the first, in units of their covariance, over their number."""
-    from_first = truth.rotations @ truth.rotations[0].mT
-    translations = truth.translations - (from_first @ truth.translations[0])
-    turned = found.rotations.mT @ from_first
-    moved = (found.rotations.mT @ (translations - found.translations)[..., None])[..., 0]
-    skew = (turned - turned.mT) / 2
-    rotation = torch.stack([skew[:, 2, 1], skew[:, 0, 2], skew[:, 1, 0]], dim=-1)  # to first order
-    tangents = torch.cat([moved, rotation], dim=-1)[1:].flatten()
-    return float(tangents @ torch.linalg.solve(found.covariance, tangents)) / len(tangents)
+    tangents = deviation(found, true_poses(given))
+    squared = float(tangents @ torch.linalg.solve(found.covariance, tangents)) / len(tangents)
+    return Outcome(errors.mean_translation_m, bound_m, squared)
 
 
 def main() -> None:

@@ -168,8 +168,7 @@ class CameraPointLoss(Loss, ABC):
             exact: whether the blocks by the points are those of the exact Hessian, with the curvature of kernel and projection.
             unknowns: what else is unknown of the cameras; None where that is nothing.
         """
-        squared = self._squared(points_cam, pixels, cameras)
-        weights = self.weight * information * self.kernel.weight(squared * information)
+        squared, weights = self._weighted(points_cam, pixels, information, cameras)
         residuals, jacobian = self._with_jacobian(points_cam, pixels, cameras)
         hessian = torch.einsum("...nmi,...nmj,...n->...nij", jacobian, jacobian, weights)
         if exact:
@@ -186,9 +185,7 @@ class CameraPointLoss(Loss, ABC):
                 coupling=torch.einsum("...cknm,...cnmi,...cij->...ckjn", weighted, jacobian, rotations),
             )
         return CameraPointTerms(
-            cost=self.total(squared * information, over=2),
-            squares=(weights * squared).sum(-1),
-            weights=weights.sum(-1),
+            *self._sums(squared, squared * information, weights),
             gradient=rotations.mT @ gradient,
             hessian=six_entries(hessian.movedim(-3, -1)),
             unknown=terms,
@@ -204,8 +201,7 @@ class CameraPointLoss(Loss, ABC):
         unknowns: CameraUnknownsAt | None = None,
     ) -> CameraPointSlopes:
         """The terms of first order alone, here by automatic differentiation; the arguments are those of :meth:`linearise`."""
-        squared = self._squared(points_cam, pixels, cameras)
-        weights = self.weight * information * self.kernel.weight(squared * information)
+        squared, weights = self._weighted(points_cam, pixels, information, cameras)
         residuals, jacobian = self._with_jacobian(points_cam, pixels, cameras)
         gradient = torch.einsum("...nm,...nmi,...n->...in", residuals, jacobian, weights)
         by_unknowns = None
@@ -213,9 +209,7 @@ class CameraPointLoss(Loss, ABC):
             columns = self._by_unknowns(unknowns, points_cam)
             by_unknowns = torch.einsum("...cknm,...cnm,...cn->...ck", columns, residuals, weights)
         return CameraPointSlopes(
-            cost=self.total(squared * information, over=2),
-            squares=(weights * squared).sum(-1),
-            weights=weights.sum(-1),
+            *self._sums(squared, squared * information, weights),
             gradient=rotations.mT @ gradient,
             unknown_gradient=by_unknowns,
         )
@@ -255,7 +249,7 @@ class CameraPointLoss(Loss, ABC):
 
         The arguments are those of :meth:`linearise`.
         """
-        weights = self.weight * information * self.kernel.weight(self._squared(points_cam, pixels, cameras) * information)
+        _, weights = self._weighted(points_cam, pixels, information, cameras)
         columns: list[Tensor] = []
         for axis in rotations.unbind(-1):
             with forward_ad.dual_level():
@@ -263,6 +257,15 @@ class CameraPointLoss(Loss, ABC):
                 columns.append(tangent(self._residuals(moving.mT, pixels.mT, cameras)))
         pairs = [(columns[i] * columns[j]).sum(-1) for i in range(3) for j in range(i, 3)]
         return torch.stack([(weights * pair).sum(-2) for pair in pairs], dim=-2)
+
+    def _weighted(self, points_cam: Tensor, pixels: Tensor, information: Tensor, cameras: Intrinsics) -> tuple[Tensor, Tensor]:
+        """Squared residuals (..., C, N), not divided by sigma, and the weights of the keypoints with the kernel's."""
+        squared = self._squared(points_cam, pixels, cameras)
+        return squared, self.weight * information * self.kernel.weight(squared * information)
+
+    def _sums(self, squared: Tensor, whitened: Tensor, weights: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Cost, squares and weights of the terms, of squared residuals (..., C, N), as they are and divided by sigma^2."""
+        return self.total(whitened, over=2), (weights * squared).sum(-1), weights.sum(-1)
 
     def _squared(self, points_cam: Tensor, pixels: Tensor, cameras: Intrinsics) -> Tensor:
         """Squared residuals (..., C, N), not divided by sigma."""

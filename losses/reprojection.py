@@ -137,9 +137,7 @@ class ReprojectionLoss(CameraPointLoss):
         if exact:
             hessian += at.curvature(rotations, gradient, cameras)
         return CameraPointTerms(
-            cost=self.total(at.squared, over=2),
-            squares=(at.weights * at.squared_px).sum(-1),
-            weights=at.weights.sum(-1),
+            *self._sums(at.squared_px, at.squared, at.weights),
             gradient=gradient,
             hessian=hessian,
             unknown=None if unknowns is None else _by_unknowns(unknowns.projection_derivatives(at.u, at.v, at.pixel), at),
@@ -162,9 +160,7 @@ class ReprojectionLoss(CameraPointLoss):
             ex, ey = (derivative.to(wx) for derivative in unknowns.projection_derivatives(at.u, at.v, at.pixel))
             by_unknowns = (ex @ wx.unsqueeze(-1) + ey @ wy.unsqueeze(-1))[..., 0]
         return CameraPointSlopes(
-            cost=self.total(at.squared, over=2),
-            squares=(at.weights * at.squared_px).sum(-1),
-            weights=at.weights.sum(-1),
+            *self._sums(at.squared_px, at.squared, at.weights),
             gradient=gradient.addcmul_(at.b, wy.unsqueeze(-2)),
             unknown_gradient=by_unknowns,
         )

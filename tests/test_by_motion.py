@@ -1,4 +1,4 @@
-"""Wrong keypoints that agree by chance, and right ones that do not agree with anything, are told by motion."""
+"""The motion of a point shows which keypoints are wrong although they agree by chance, and which are right."""
 
 from __future__ import annotations
 

@@ -189,9 +189,14 @@ class Observations:
         return point_index(name, self.point_names)
 
     @property
+    def at_corner(self) -> Tensor:
+        """(C, F, P), True for keypoints at exactly (0, 0), by which many detectors mean that a point was not seen."""
+        return (self.keypoints == 0).all(-1) & self.visible
+
+    @property
     def warnings(self) -> tuple[str, ...]:
         """What is probably not meant as it was given."""
-        at_corner = int(((self.keypoints == 0).all(-1) & self.visible).sum())
+        at_corner = int(self.at_corner.sum())
         if not at_corner:
             return ()
         return (

@@ -40,7 +40,7 @@ _SAID_BY_IMAGES = 2.0
 CONSTANT_SIGMAS = 0.5
 """Errors that are always the same, over the noise, from which on they matter."""
 _LEAST_FRAMES = 20
-"""Frames of a point in a camera from which on it can be told which part of its errors is always the same."""
+"""Least number of frames in which a camera sees a point, for the mean of its errors to be known."""
 _OTHER_PERSON_SHARE = 0.2
 """Share of a camera's frames that were set aside as those of another person, from which on the camera itself is doubted."""
 
@@ -218,7 +218,7 @@ class Evidence:
 
     @cached_property
     def constant_errors_sigmas(self) -> float:
-        """Root mean square of the errors that are always the same, over the noise; 0 where that cannot be told."""
+        """Root mean square of :attr:`constant_errors_px`, divided by the noise; 0 where no point is seen in enough frames."""
         told = self.constant_errors_px != 0
         return float((self.constant_errors_px / self.sigma_px)[told].square().mean().sqrt()) if bool(told.any()) else 0.0
 

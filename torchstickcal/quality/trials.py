@@ -186,10 +186,10 @@ def tried(
 def sight_of(evidence: Evidence, camera: int) -> Sight:
     """One camera as it was given, without keypoints at exactly (0, 0)."""
     observations = evidence.observations
-    keypoints = observations.keypoints[camera].double()
+    seen = (observations.visible & ~observations.at_corner)[camera]
     size = observations.image_size
     return Sight(
-        keypoints.where((observations.visible[camera] & (keypoints != 0).any(-1))[..., None], torch.nan),
+        observations.keypoints[camera].double().where(seen[..., None], torch.nan),
         observations.cameras[camera : camera + 1],
         None if size is None else (size if size.ndim == 1 else size[camera]),
     )

@@ -35,7 +35,7 @@ def _values(evidence: Evidence) -> Iterator[Finding]:
     visible = observations.visible
     total = max(1, int(visible.sum()))
     for sentence in observations.warnings:
-        share = int(((observations.keypoints == 0).all(-1) & visible).sum()) / total
+        share = int(observations.at_corner.sum()) / total
         many = share > _CORNER_SHARE
         meaning, advice = sentence.rsplit(" Set them", 1)
         yield Finding(

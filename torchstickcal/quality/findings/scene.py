@@ -99,8 +99,8 @@ def _upside_down(evidence: Evidence) -> Iterator[Finding]:
     feet = [i for i, name in enumerate(names) if name.endswith(("ankle", "heel", "toe"))]
     if not heads or not feet:
         return
-    keypoints = evidence.observations.keypoints.double()
-    heights = keypoints[..., 1].where(evidence.observations.visible & (keypoints != 0).any(-1), torch.nan)
+    observations = evidence.observations
+    heights = observations.keypoints[..., 1].double().where(observations.visible & ~observations.at_corner, torch.nan)
     below = heights[..., heads].nanmean(-1) - heights[..., feet].nanmean(-1)
     for camera, own in enumerate(below):
         own = own[own.isfinite()]
