@@ -17,7 +17,7 @@ from torchstickcal.geometry.triangulation import triangulate
 from torchstickcal.model.measurements import Measurements
 from torchstickcal.model.state import State
 
-_MANY_CONTRADICTED = 0.05
+_MANY_CONTRADICTED = 0.01
 """Share of a session's keypoints that contradict their points, from which on views are taken to agree by chance."""
 _REACH = 2
 """Frames before and after from which the place of a point is predicted."""

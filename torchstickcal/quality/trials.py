@@ -176,7 +176,7 @@ def tried(
         name: replace(stage, max_iterations=min(stage.max_iterations, _TRIAL_ITERATIONS))
         for name, stage in config.stages.items()
     }
-    run = Run(replace(config, stages=stages), must_converge=must_converge)
+    run = Run(replace(config, stages=stages, solver="gauss_newton"), must_converge=must_converge)
     try:
         return adjust_cameras(begin(observations, run, refined), run)
     except CalibrationError:

@@ -23,6 +23,8 @@ from torchstickcal.solvers.elimination.points import PointElimination
 
 _ITERATIONS_PER_ROUND, _MAX_ROUNDS = 100, 20
 _DAMPING = 1e-6
+_NEGLIGIBLE = 1e-7
+"""Step of the preconditioned unknowns, in standard deviations, or decrease of the cost, at which a round ends."""
 
 
 class _PreconditionedState:
@@ -132,7 +134,7 @@ def _run_round(objective: Objective, preconditioned: _PreconditionedState) -> St
         history_size=_ITERATIONS_PER_ROUND,
         line_search_fn="strong_wolfe",
         tolerance_grad=0.0,
-        tolerance_change=0.0,
+        tolerance_change=_NEGLIGIBLE,
     )
 
     def closure() -> Tensor:
