@@ -25,7 +25,7 @@ class LossContext:
         sigma_px: (B, P), estimated noise of each point's keypoints, pixels.
         correlation_frames: gives the numbers (B, P) of keypoints that count as one, because their errors are alike; for
             ``estimated``, or for a number of frames.
-        acceleration_m: estimates (B, P), the standard deviation of each point's second difference over frames, metres.
+        acceleration_m: estimates (B, F - 2, P), the standard deviation of each point's second difference over frames, metres.
     """
 
     point: Callable[[str], int]

@@ -51,7 +51,7 @@ class SmoothnessSettings(LossSettings):
 
     Args:
         sigma_m: standard deviation of a second difference over frames, metres; ``estimated`` takes it from the session, for
-            each point.
+            each point and time.
         weight: factor on the loss.
     """
 
@@ -61,5 +61,5 @@ class SmoothnessSettings(LossSettings):
     loss = SmoothnessLoss
 
     def build(self, context: LossContext) -> SmoothnessLoss:
-        sigma = context.acceleration_m()[:, None] if self.sigma_m == "estimated" else self.sigma_m
+        sigma = context.acceleration_m() if self.sigma_m == "estimated" else self.sigma_m
         return SmoothnessLoss(sigma, self.weight)

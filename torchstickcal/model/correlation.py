@@ -30,6 +30,7 @@ _LEAST_VARIANCE = 0.05
 """Squared residual, in units of the noise, below which residuals are rounding errors."""
 _LARGEST_AMPLITUDE = 10.0
 _FARTHEST = 1.0
+_LEAST_JITTER = 0.02
 _MEAN_BY_CHANCE = 0.8
 """Mean of a positive quantity of which zero was found, in standard deviations of the estimate."""
 _VALUES_AT_ONCE = 2**22
@@ -80,6 +81,12 @@ class ErrorCorrelation:
         frames = self.values.shape[-1]
         found = 1 - torch.arange(1, frames).to(self.values) / frames
         return 1 + 2 * self.values[..., 1:] @ found
+
+    @property
+    def jitter(self) -> Tensor:
+        """Variance of the errors' second differences over frames, as a share of that of independent errors, (B, P)."""
+        lags = self.values[..., 1:3]
+        return (1 - lags @ lags.new_tensor([4 / 3, -1 / 3])[: lags.shape[-1]]).clamp_min(_LEAST_JITTER)
 
     def spectrum(self, frames: int) -> Tensor:
         """Power of the errors at the frequencies of ``rfft`` over 2 ``frames`` frames, (B, P, frames + 1), mean 1."""

@@ -23,8 +23,10 @@ _LOWER_QUARTILE = -0.6745
 """Of the standard normal distribution."""
 _MIN_SIGMA_PX = 1e-4
 _MIN_ACCELERATION_M = 1e-5
-_MIN_VARIANCE_RATIO = 0.01
+_MIN_VARIANCE_RATIO = 0.05
 """Smallest variance of the true acceleration, as a fraction of the variance that noise gives to the measured acceleration."""
+_NEAR_FRAMES, _USUAL_FRAMES = 12, 3.0
+"""Frames before and after that tell how a point accelerates, less the farther away; all frames together count as this many."""
 
 
 def estimate_sigma_px(measurements: Measurements, squared_residuals: Tensor) -> Tensor:
@@ -78,25 +80,41 @@ def sigma_px_of(measurements: Measurements, squared_residuals: Tensor, taking_pa
 
 
 def estimate_acceleration_m(measurements: Measurements, points: Tensor, point_variance: Tensor) -> Tensor:
-    """Standard deviation of the second difference of a point's true motion along an axis, (B, P), metres.
+    """Standard deviation of the second difference of a point's true motion along an axis, (B, F - 2, P), metres.
 
-    It is the variance of the measured second differences minus the variance that the noise of the points explains. A lower
-    limit is set by the noise: a much smaller acceleration cannot be detected.
+    It is the variance of the measured second differences minus the variance that the noise of the points explains, on average
+    over the frames near: who swings stands still before. A lower limit is set by the noise: a much smaller acceleration cannot
+    be detected.
 
     Args:
-        measurements: the sessions.
+        measurements: the sessions, of F frames.
         points: (B, 3, N).
-        point_variance: variance of each triangulated point, mean over the three axes, (B, N), square metres.
+        point_variance: what the noise explains of the variance of each triangulated point, mean over the three axes, (B, N),
+            square metres.
     """
     complete = consecutive(measurements.by_frame(measurements.active), len(SmoothnessLoss.stencil))
     x, noise = measurements.by_frame(points), measurements.by_frame(point_variance).double()
     measured = combined(x, SmoothnessLoss.stencil, dim=-2).square().mean(1)
     expected = noise[:, 2:] + 4 * noise[:, 1:-1] + noise[:, :-2]
     weights = complete / expected.clamp_min(_MIN_ACCELERATION_M**2)
-    total = weights.sum(1).clamp_min(1e-300)
-    variance = ((measured - expected) * weights).sum(1) / total
-    detectable = _MIN_VARIANCE_RATIO * complete.sum(1) / total
+    motion = (measured - expected) * weights
+    count, total = complete.sum(1, keepdim=True), weights.sum(1, keepdim=True).clamp_min(1e-300)
+    overall = (motion.sum(1, keepdim=True) / total).clamp_min(0.0)
+    near, nearby = _sums_near(motion), _sums_near(weights)
+    usual = _USUAL_FRAMES * total / count.clamp_min(1)
+    variance = (near + usual * overall) / (nearby + usual)
+    detectable = _MIN_VARIANCE_RATIO * count / total
     return torch.maximum(variance, detectable).clamp_min(_MIN_ACCELERATION_M**2).sqrt()
+
+
+def _sums_near(values: Tensor) -> Tensor:
+    """Weighted sums over the frames near each frame, of values (B, F, P)."""
+    window = torch.hann_window(2 * _NEAR_FRAMES + 1, periodic=False).to(values)[None, None]
+    tracks = values.movedim(1, 2)
+    if not tracks.shape[2]:
+        return values
+    sums = torch.nn.functional.conv1d(tracks.flatten(0, 1)[:, None], window, padding=_NEAR_FRAMES)
+    return sums.view_as(tracks).movedim(2, 1)
 
 
 def _frames_looked_at(measurements: Measurements) -> Tensor:

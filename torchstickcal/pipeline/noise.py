@@ -15,8 +15,9 @@ from torch import Tensor
 
 from torchstickcal.config import Config, Stage
 from torchstickcal.errors import ConfigError
+from torchstickcal.lazy import cached_property
 from torchstickcal.losses import Loss, LossContext, LossSettings, TrackLoss
-from torchstickcal.model.correlation import CorrelationGates, error_correlation
+from torchstickcal.model.correlation import CorrelationGates, ErrorCorrelation, error_correlation
 from torchstickcal.model.measurements import Measurements
 from torchstickcal.model.noise import estimate_acceleration_m, sigma_px_of
 from torchstickcal.model.objective import Objective
@@ -39,7 +40,8 @@ class NoiseLevels(NamedTuple):
     correlation_frames: Tensor
     """(B, P), as many keypoints count as one, because their errors are alike"""
     acceleration_m: Tensor
-    """(B, P), standard deviation of the second difference over frames, metres; infinite where no loss needs it"""
+    """(B, F - 2, P), standard deviation of the second difference over frames that counts as usual, metres; (B, P) and infinite
+    where no loss needs it"""
 
     def of(self, sessions: slice) -> NoiseLevels:
         """The levels of some of the sessions."""
@@ -47,7 +49,8 @@ class NoiseLevels(NamedTuple):
 
     def replaced(self, where: Tensor, other: NoiseLevels) -> NoiseLevels:
         """The levels with some sessions (B,), True where, taken from another."""
-        return NoiseLevels(*(torch.where(where[:, None], new, old) for old, new in zip(self, other, strict=True)))
+        pairs = zip(self, other, strict=True)
+        return NoiseLevels(*(torch.where(where.view(-1, *[1] * (new.ndim - 1)), new, old) for old, new in pairs))
 
 
 @dataclass(frozen=True)
@@ -220,22 +223,32 @@ class _Levels:
         self.gates: CorrelationGates | None = None
 
     def correlation_frames(self, given: float | str) -> Tensor:
-        times = torch.full_like(self.sigma_px, 1.0 if given == _ESTIMATED else float(given))
-        if given == _ESTIMATED:
-            gates = None if self._held is None else self._held.correlation
-            found = error_correlation(self._kept, self._state, self.sigma_px, _CONTRAST, gates)
-            times, self.gates = found.times, found.gates
+        times = self._correlation.times if given == _ESTIMATED else torch.full_like(self.sigma_px, float(given))
         self.levels = self.levels._replace(correlation_frames=times)
         return times
 
     def acceleration_m(self, losses: dict[str, Loss]) -> Tensor:
-        objective = Objective(self._kept, losses)
+        """Of the smoothness, which the keypoints weigh against their noise as if it were independent in each frame.
+
+        What lasts of the errors does not shake a track. It makes second differences smaller than the noise says, and would
+        leave no acceleration to a point that swings. And only what shakes is to be smoothed.
+        """
+        objective, jitter = Objective(self._kept, losses), self._correlation.jitter
         if self._held is None:
             variance = NormalEquations(objective, self._state, cameras_free=False).point_variance()
         else:
             variance = objective.point_variance(self._state)
-        self.levels = self.levels._replace(acceleration_m=estimate_acceleration_m(self._kept, self._state.points, variance))
-        return self.levels.acceleration_m
+        shaken = variance * jitter.repeat(1, self._kept.frames)
+        acceleration_m = estimate_acceleration_m(self._kept, self._state.points, shaken) / jitter[:, None].sqrt()
+        self.levels = self.levels._replace(acceleration_m=acceleration_m)
+        return acceleration_m
+
+    @cached_property
+    def _correlation(self) -> ErrorCorrelation:
+        gates = None if self._held is None else self._held.correlation
+        found = error_correlation(self._kept, self._state, self.sigma_px, _CONTRAST, gates)
+        self.gates = found.gates
+        return found
 
 
 def check_noise(config: Config, points: int) -> None:
