@@ -104,7 +104,9 @@ def estimate_acceleration_m(measurements: Measurements, points: Tensor, point_va
     usual = _USUAL_FRAMES * total / count.clamp_min(1)
     variance = (near + usual * overall) / (nearby + usual)
     detectable = _MIN_VARIANCE_RATIO * count / total
-    return torch.maximum(variance, detectable).clamp_min(_MIN_ACCELERATION_M**2).sqrt()
+    above, least = variance - detectable, _MIN_ACCELERATION_M**2
+    raised = detectable + (above + (above.square() + detectable.square() + least**2).sqrt()) / 2  # the larger, without a kink
+    return raised.clamp_min(least).sqrt()
 
 
 def _sums_near(values: Tensor) -> Tensor:
