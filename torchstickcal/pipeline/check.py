@@ -39,8 +39,8 @@ _PRICE = 4.0
 """Decrease of the cost that each further unknown has to bring, in units of a squared standard deviation; chance brings 1."""
 _ALIKE = 0.05
 """Relative difference of the decreases of the cost up to which two choices explain the keypoints equally well."""
-_FAR_FRAMES = 0.5
-"""Time offset from which on other frames are nearer in time: the motion of the keypoints cannot be taken as straight so long."""
+_STRAIGHT_FRAMES = 0.25
+"""Time over which the motion of the keypoints may be taken as straight."""
 _FEW_PARTS = 6.0
 """By how much a variance that only the scatter between the parts of the frames shows has to be larger to be as sure as one that
 is known: as Student's distribution of seven degrees of freedom demands at four standard deviations."""
@@ -139,8 +139,7 @@ class CameraCheck:
 
         Of the choices that explain the keypoints about equally well, and better than all others, it is the one with the fewest
         unknowns. A worse explanation is never taken instead: it would be an excuse for what the better one says. The choice
-        has to be needed and to predict (:meth:`confirms`). Where clocks are so far off that the motion is not straight, no choice
-        of them is told from another, nor how sure it is, before a trial: there it only has to predict.
+        has to be needed and to predict (:meth:`confirms`).
 
         Args:
             allowed: what may be refined.
@@ -154,13 +153,25 @@ class CameraCheck:
                 gains[names] = self._gain(names)
         clear, best = _SIGMAS**2, max(gains.values(), default=0.0)
         least = max(clear, best - max(clear, _ALIKE * best))
-        clocks_as_given = not clock_refinements() & set(refined)
-        far = {names for names, gain in gains.items() if clocks_as_given and gain > clear and self._is_far_in_time(names)}
-        alike = {names for names, gain in gains.items() if gain > least}
-        for names in sorted(alike | far if alike & far else alike, key=lambda n: (len(self._solved(n).values), -gains[n])):
-            if (names in far or self._is_needed(names)) and self._predicts(names):
+        alike = [names for names, gain in gains.items() if gain > least]
+        for names in sorted(alike, key=lambda names: (len(self._solved(names).values), -gains[names])):
+            if self._is_needed(names) and self._predicts(names):
                 return names
         return ()
+
+    def may_be_far_in_time(self, allowed: Collection[str]) -> bool:
+        """Whether the keypoints ask for clocks so far off that the motion is not straight: what they would be is not known here.
+
+        Args:
+            allowed: what may be refined.
+        """
+        for names in _choices():
+            if set(names) <= set(allowed) & clock_refinements() and self._gain(names) > _SIGMAS**2:
+                unknowns, values, _ = self._solved(names)
+                offsets = [values[columns] for name, columns in unknowns.columns.items() if name == "time_offset"]
+                if any(bool((own.abs() > _STRAIGHT_FRAMES).any()) for own in offsets):
+                    return True
+        return False
 
     def confirms(self, names: tuple[str, ...], deviations: Mapping[str, Tensor]) -> bool:
         """Whether a choice that has been refined here is needed and predicts.
@@ -214,12 +225,6 @@ class CameraCheck:
         jackknife = (len(folds) - 1) * without.var(0, correction=0)
         ratio = float((jackknife / self._solved(names).covariance.diagonal()).mean())
         return 1.0 + _FEW_PARTS * max(0.0, ratio - 1.0)
-
-    def _is_far_in_time(self, names: tuple[str, ...]) -> bool:
-        """Whether a choice has clocks that are so far off that other frames are nearer in time."""
-        unknowns, values, _ = self._solved(names)
-        clocks = [columns for name, columns in unknowns.columns.items() if all_unknowns()[name].family == "clock"]
-        return any(bool((values[columns].abs() > _FAR_FRAMES).any()) for columns in clocks)
 
     def _predicts(self, names: tuple[str, ...], values: Tensor | None = None) -> bool:
         """Whether a choice, found without some frames or without some points, makes these fit better, beyond doubt.

@@ -150,24 +150,37 @@ class ModelSelection:
         """Adjusted with what the keypoints contradict of the cameras, the most contradicted first, and checked again.
 
         What was found is kept only if it fits better and is still needed there: the check is about the first step, and the
-        adjustment may end elsewhere. Where the given cameras do not converge, nothing more is estimated.
+        adjustment may end elsewhere. Where the given cameras do not converge, nothing more is estimated. Where clocks may be so
+        far off that the check cannot say how far, the motion in the images does.
         """
+        if not adjusted.converged:
+            return adjusted, check
+        if "time_offset" not in adjusted.refined and check.may_be_far_in_time(self.allowed):
+            for offsets in search_offsets(*self._keypoints_and_reach).alternatives:
+                elsewhere = adjust_cameras(begin_at_nearest_frames(adjusted, self._run, offsets), self._run, only_last=True)
+                if (confirmed := self._confirmed(("time_offset",), self._at_nearest_frames(elsewhere), adjusted)) is not None:
+                    adjusted, check = confirmed
+                    break
         failed: list[tuple[str, ...]] = []
-        for _ in range(_MOST_TRIALS if adjusted.converged else 0):
+        for _ in range(_MOST_TRIALS):
             choice = check.wanted(self.allowed, adjusted.refined, failed)
             if not choice:
                 break
             refined = self._with(adjusted, with_refinements(adjusted.refined, choice))
-            refined_check = CameraCheck(refined, self._run.config.camera_groups) if refined.converged else None
-            if (
-                refined_check is not None
-                and _median_squared_residual(refined) <= _BY_CHANCE * _median_squared_residual(adjusted)
-                and refined_check.confirms(choice, refined.deviations)
-            ):
-                adjusted, check = refined, refined_check
+            if (confirmed := self._confirmed(choice, refined, adjusted)) is not None:
+                adjusted, check = confirmed
             else:
                 failed.append(refined.refined)
         return adjusted, check
+
+    def _confirmed(
+        self, choice: tuple[str, ...], refined: Adjustment, before: Adjustment
+    ) -> tuple[Adjustment, CameraCheck] | None:
+        """An adjustment with a choice refined, and its check; None if it does not fit better or the choice is not needed."""
+        if not refined.converged or _median_squared_residual(refined) > _BY_CHANCE * _median_squared_residual(before):
+            return None
+        check = CameraCheck(refined, self._run.config.camera_groups)
+        return (refined, check) if check.confirms(choice, refined.deviations) else None
 
     def _at_offsets(self, clocks: ClockEstimate) -> list[Adjustment]:
         """Adjusted at those of the offsets at which the views clearly fit together better than at the given times.
