@@ -160,7 +160,7 @@ class CameraCheck:
         return ()
 
     def may_be_far_in_time(self, allowed: Collection[str]) -> bool:
-        """Whether the keypoints ask for clocks so far off that the motion is not straight: what they would be is not known here.
+        """Whether the keypoints ask for clocks so far off that the motion is not straight; how far is then not known here.
 
         Args:
             allowed: what may be refined.
@@ -212,7 +212,7 @@ class CameraCheck:
         return all(_is_far(values[own], usual[own][:, own]) for own in unknowns.columns.values())
 
     def _inflation(self, names: tuple[str, ...]) -> float:
-        """How much larger the variances of a choice's values may be than those stated, by the scatter between parts of the frames.
+        """How much larger a choice's variances may be than those stated, by the scatter between parts of the frames.
 
         Errors that several points or cameras have in common in a frame are alike. That is seen here, not in any point's track.
         A few parts do not show a variance well, so what they add to the stated one counts more.

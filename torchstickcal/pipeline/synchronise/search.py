@@ -45,8 +45,8 @@ _MIN_LOG_DIFFERENCE = 0.3
 above 1 for cameras that are whole frames apart."""
 
 _CLEARLY_LESS = math.log(2.0)
-"""Difference of :func:`_log_unexplained` by which most pairs of cameras have to fit better at other offsets: half as much is left
-unexplained. A camera with poor keypoints fits a little better at some of many lags by chance, and then not with most others."""
+"""Difference of :func:`_log_unexplained` by which most pairs of cameras have to fit better at other offsets: half as much is
+left unexplained. A camera with poor keypoints fits a little better at some of many lags by chance, but not with most others."""
 
 Fits = dict[tuple[int, int], EpipolarFit]
 """Epipolar residuals of all pairs of cameras."""
@@ -98,8 +98,8 @@ def search_offsets(measurements: Measurements, max_offset_frames: float, noise_p
 def clocks_unlike_given(measurements: Measurements, max_offset_frames: float, noise_px: float = 2.0) -> ClockEstimate | None:
     """The time offsets where the cameras' frames clearly do not belong together as given; None where they do.
 
-    Where no camera fits camera 0 better at another lag, that takes much less time than :func:`search_offsets`, which has the same
-    arguments.
+    Where no camera fits camera 0 better at another lag, it takes much less time than :func:`search_offsets`. The arguments are
+    the same.
     """
     if not _doubtful(measurements, max_offset_frames, noise_px):
         return None
