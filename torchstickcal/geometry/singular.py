@@ -64,8 +64,8 @@ def covariance_root(information: Tensor) -> Tensor:
 def definite(covariance: Tensor) -> Tensor:
     """Covariances (..., K, K) as they are where they are positive definite, and elsewhere without what rounding made of them.
 
-    Where the variances along some directions are 1e16 times those along others, rounding errors of the large ones are larger than
-    the small ones, and leave eigenvalues of zero and below. There these are raised to the size of the rounding errors.
+    Where the variances along some directions are 1e16 times those along others, rounding errors of the large ones are larger
+    than the small ones, and leave eigenvalues of zero and below. There these are raised to the size of the rounding errors.
 
     Example:
         >>> rounded = torch.tensor([[1.0, 1.0 + 1e-15], [1.0 + 1e-15, 1.0]], dtype=torch.float64)
