@@ -123,10 +123,10 @@ class Evidence:
 
     @cached_property
     def uneven(self) -> Tensor:
-        """(C,), how much the share of keypoints that agree differs between a camera's points, beyond chance: standard deviation.
+        """(C,), standard deviation between a camera's points of the share of their keypoints that agree, beyond chance.
 
-        A detector that fails now and then is wrong at any point. A camera that shows something else agrees at some points, which
-        hardly move, and not at others.
+        A detector that fails now and then is wrong at any point. A camera that shows something else agrees at some points,
+        which hardly move, and not at others.
         """
         seen, kept = (m.by_frame(m.visible[0]).sum(1).double() for m in (self.measurements, self.kept))
         share = (kept.sum(-1) / seen.sum(-1).clamp_min(1))[:, None]

@@ -80,8 +80,8 @@ def _shares(evidence: Evidence) -> Iterator[Finding]:
             yield Finding(
                 "camera_contradicts",
                 Severity.CAUTION,
-                f"{name}: only {100 * share:.0f} % of its keypoints agree with the other cameras. The others are spread over all "
-                "points, as those of a detector that often fails.",
+                f"{name}: only {100 * share:.0f} % of its keypoints agree with the other cameras. The others are spread over "
+                "all points, as those of a detector that often fails.",
                 "Look at its video with the keypoints drawn into it.",
                 limit=_AGREEING_SHARE,
                 **common,
