@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -10,6 +11,8 @@ import torch
 from numpy.typing import NDArray
 
 from torchstickcal import Calibration, Observations, calibrate
+from torchstickcal.io import read_session
+from torchstickcal.pipeline import adjust
 from torchstickcal.pipeline.check import CameraCheck
 from torchstickcal.pipeline.selection import ModelSelection
 from torchstickcal.simulate import Clocks, Noise, SessionSpec, golf_session
@@ -61,6 +64,32 @@ def test_clocks_about_a_frame_off_are_found(sport: str, frames: tuple[float, ...
     assert session.truth.time_offsets_s is not None
     assert "time_offset" in found.refined
     assert (found.time_offsets - session.truth.time_offsets_s).abs().max() * FPS < 0.1
+
+
+@pytest.mark.parametrize("cameras", [[0, 1, 2], [0, 1, 3], [0, 1, 2, 3]])
+def test_a_recorded_board_whose_parts_disagree_about_the_clocks_is_left_as_it_is(data: Path, cameras: list[int]):
+    """With time offsets of 0.4 frames its keypoints fit better, but not with the same offsets in all parts of the recording."""
+    observations, _ = read_session(data / "real" / "caliscope_post_optimization.npz")
+    observations = observations.of_cameras(cameras)
+    same(calibrate(observations), calibrate(observations, refine="auto"))
+
+
+@pytest.mark.parametrize("cameras", [[0, 1, 3], [1, 2, 3]])
+def test_a_camera_with_poor_keypoints_costs_no_second_start(data: Path, cameras: list[int], monkeypatch: pytest.MonkeyPatch):
+    """It fits a little better at some of many time offsets. The cameras were in step."""
+    starts = 0
+    start = adjust.initialise
+
+    def counted(*arguments) -> object:
+        nonlocal starts
+        starts += 1
+        return start(*arguments)
+
+    monkeypatch.setattr(adjust, "initialise", counted)
+    observations, _ = read_session(data / "real" / "caliscope_board_and_person.npz")
+    found = calibrate(observations.of_cameras(cameras), refine="auto")
+    assert found.refined == ()
+    assert starts == 1
 
 
 def test_trials_are_few_and_leave_nothing_behind(monkeypatch: pytest.MonkeyPatch):

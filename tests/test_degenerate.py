@@ -12,13 +12,13 @@ from torch import Tensor
 
 from torchstickcal import CalibrationLayer, Observations, RigError, Stick, calibrate
 from torchstickcal.config import Refine
-from torchstickcal.geometry.singular import covariance_of, solve_information
+from torchstickcal.geometry.singular import covariance_of, definite, propagated, solve_information
 from torchstickcal.model.measurements import Measurements
 from torchstickcal.pipeline.initialise.graph import _resected
 from torchstickcal.pipeline.scale import Ruler, outvoted_factors, scale_factors
-from torchstickcal.pipeline.synchronise import search_offsets
-from torchstickcal.pipeline.synchronise.search import unsynchronised
+from torchstickcal.pipeline.synchronise import clocks_unlike_given, search_offsets
 from torchstickcal.simulate import Noise, golf_session
+from torchstickcal.solvers.uncertainty import centre_covariances
 
 
 def session(cameras: int = 4, frames: int = 24, sigma_px: float = 0.5) -> Observations:
@@ -44,6 +44,26 @@ def test_singular_systems_are_solved_as_far_as_they_are_determined():
     covariance = covariance_of(singular)
     assert direction @ covariance @ direction > 1e10
     torch.testing.assert_close(singular @ covariance @ singular, singular, rtol=1e-3, atol=1e-3)
+
+
+@pytest.mark.parametrize("size", [6, 12, 18])
+@pytest.mark.parametrize("seed", range(3))
+def test_no_variance_is_negative_where_some_are_far_larger_than_others(seed: int, size: int):
+    """As of a session that is grossly wrong: rounding of the large variances is larger than the small ones."""
+    generator = torch.Generator().manual_seed(seed)
+    turned = torch.linalg.qr(torch.randn(size, size, generator=generator, dtype=torch.float64)).Q
+    root = turned * torch.logspace(-9, 8, size, dtype=torch.float64)
+    rounded = root @ root.mT
+    assert int(torch.linalg.cholesky_ex(rounded).info) > 0
+    mended = definite(rounded)
+    assert int(torch.linalg.cholesky_ex(mended).info) == 0
+    torch.testing.assert_close(mended, rounded, rtol=0, atol=1e-11 * float(rounded.abs().max()))
+    directions = turned.mT[:, None]
+    assert (directions @ rounded @ directions.mT).min() < 0 < propagated(directions, rounded).min()
+    centres = torch.randn(size // 6 + 1, 3, generator=generator, dtype=torch.float64)
+    assert (centre_covariances(centres, rounded).diagonal(dim1=1, dim2=2) >= 0).all()
+    sound = rounded + torch.eye(size) * rounded.abs().max()
+    assert definite(sound) is sound
 
 
 @pytest.mark.parametrize("bad", [0.0, torch.nan, torch.inf])
@@ -130,7 +150,7 @@ def test_motionless_keypoints_have_no_time_offset():
     keypoints = session().keypoints[:, :1].expand(-1, 40, -1, -1).clone()
     measurements = Measurements.of(with_keypoints(session(), keypoints))
     assert search_offsets(measurements, 1e308).determined == (True, False, False, False)
-    assert not unsynchronised(measurements, 10)
+    assert clocks_unlike_given(measurements, 10) is None
 
 
 def test_a_ruler_that_is_never_reconstructed_sets_no_scale():

@@ -118,6 +118,19 @@ def test_exchanges_of_the_ends_of_a_stick_are_undone(named: bool):
     assert error_m(found, truth) < 1.1 * error_m(clean, truth) + 1e-4
 
 
+def test_keypoints_that_are_often_wrong_are_no_other_person():
+    """Few agree in some frames by chance, and the verdict says that many are wrong, not that a camera is."""
+    observations, truth = session(cameras=5, frames=16)
+    random = np.random.default_rng(3)
+    anywhere = random.uniform(0, 1000, observations.keypoints.shape)
+    wrong = random.random(observations.keypoints.shape[:3]) < 0.48
+    keypoints = np.where(wrong[..., None] & observations.visible.numpy()[..., None], anywhere, observations.keypoints.numpy())
+    found = calibrate(replace(observations, keypoints=torch.from_numpy(keypoints)))
+    assert error_m(found, truth) < 0.05
+    assert found.other_person.sum() <= 1
+    assert found.quality.verdict.acceptable
+
+
 def test_another_person_is_set_aside():
     observations, truth = session()
     where = chosen(observations, 0.2) & torch.tensor([True, False, False, False])[:, None]

@@ -9,7 +9,7 @@ import torch
 
 from torchstickcal import ObservationError, Observations, Stick
 from torchstickcal.model.measurements import Measurements
-from torchstickcal.pipeline.synchronise import on_common_frames, search_offsets
+from torchstickcal.pipeline.synchronise import clocks_unlike_given, on_common_frames, search_offsets
 from torchstickcal.pipeline.synchronise.epipolar import Tracks
 from torchstickcal.simulate import Clocks, Noise, SessionSpec
 from torchstickcal.simulate.regimes import DroppedFrames, FrameRates, Gaps, SelfOcclusion
@@ -45,6 +45,19 @@ def test_synchronised_cameras_have_no_offsets():
     session = replace(SPEC, clocks=Clocks()).generate()
     found = search_offsets(Measurements.of(session.observations), 30)
     assert found.offsets_frames.abs().max() < 0.2
+
+
+@pytest.mark.parametrize(("offset_s", "noisy"), [(0.0, False), (0.0, True), (1.0, False), (1.0, True)])
+def test_other_clocks_are_offered_where_most_pairs_of_cameras_fit_clearly_better(offset_s: float, noisy: bool):
+    session = replace(SPEC, clocks=Clocks(offset_s)).generate()
+    keypoints = session.observations.keypoints.clone()
+    if noisy:  # it fits a little better at some lag
+        keypoints[1] += 40 * torch.randn(keypoints[1].shape, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+    found = clocks_unlike_given(Measurements.of(replace(session.observations, keypoints=keypoints)), 30)
+    assert (found is not None) == (offset_s > 0)
+    if found is not None:
+        others = [0, 2, 3] if noisy else [0, 1, 2, 3]
+        assert (found.alternatives[0] - SPEC.fps * session.truth.time_offsets_s)[others].abs().max() < 0.5
 
 
 def test_offsets_without_motion_are_undetermined():

@@ -6,9 +6,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import torch
+from torch import Tensor
 
 from torchstickcal.benchmark.cases import Case
 from torchstickcal.geometry import se3
+from torchstickcal.io.truth import Truth
 from torchstickcal.losses import ReprojectionLoss, StickLengthLoss
 from torchstickcal.metrics import pose_errors
 from torchstickcal.model.measurements import Measurements
@@ -68,7 +70,21 @@ def camera_bound(case: Case, draws: int = 2000, seed: int = 0, unknown: Sequence
     objective = Objective(measurements, {"reprojection": ReprojectionLoss(), "stick_length": StickLengthLoss(_SIGMA_LENGTH_M)})
     points = truth.points.flatten(0, 1).mT.contiguous()
     state = State(truth.rotations[None], truth.translations[None], points[None], measurements.unknowns.given)
-    factor, failed = torch.linalg.cholesky_ex(NormalEquations(objective, state, cameras_free=True).reduced[0])
+    return expected_errors(NormalEquations(objective, state, cameras_free=True).reduced[0], truth, draws, seed)
+
+
+def expected_errors(information: Tensor, truth: Truth, draws: int = 2000, seed: int = 0) -> Bound | None:
+    """The mean errors of estimates that scatter around the true cameras as an information says.
+
+    Args:
+        information: inverse covariance of the tangents of all cameras but the first, (D, D), D >= 6 (C - 1).
+        truth: the true cameras.
+        draws, seed: as of :func:`camera_bound`.
+
+    Returns:
+        The errors; None if the information does not determine the cameras.
+    """
+    factor, failed = torch.linalg.cholesky_ex(information)
     if int(failed):
         return None
     normal = torch.randn(len(factor), draws, generator=torch.Generator().manual_seed(seed), dtype=factor.dtype)

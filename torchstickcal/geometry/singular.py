@@ -11,6 +11,8 @@ from torch import Tensor
 
 _SINGULAR = 1e-12
 """Eigenvalue over the largest eigenvalue, in the units in which the diagonal is 1, below which a direction is undetermined."""
+_ROUNDING = 1e-14
+"""Relative size of the rounding errors of a covariance, for each of its rows."""
 _UNKNOWN_VARIANCE = 1e12
 """Variance of an unknown about which there is no information at all."""
 
@@ -57,6 +59,45 @@ def covariance_root(information: Tensor) -> Tensor:
     nothing = ~vectors.any(-1)
     root = (vectors * variances.sqrt()[..., None, :]).masked_fill(nothing[..., None], 0.0)
     return root + (nothing * _UNKNOWN_VARIANCE**0.5).diag_embed().to(root)
+
+
+def definite(covariance: Tensor) -> Tensor:
+    """Covariances (..., K, K) as they are where they are positive definite, and elsewhere without what rounding made of them.
+
+    Where the variances along some directions are 1e16 times those along others, rounding errors of the large ones are larger
+    than the small ones, and leave eigenvalues of zero and below. There these are raised to the size of the rounding errors.
+
+    Example:
+        >>> rounded = torch.tensor([[1.0, 1.0 + 1e-15], [1.0 + 1e-15, 1.0]], dtype=torch.float64)
+        >>> int(torch.linalg.cholesky_ex(rounded).info), int(torch.linalg.cholesky_ex(definite(rounded)).info)
+        (2, 0)
+    """
+    known = covariance.isfinite().flatten(-2).all(-1)
+    doubtful = known & (torch.linalg.cholesky_ex(covariance.where(known[..., None, None], 0.0)).info > 0)
+    if not bool(doubtful.any()):
+        return covariance
+    diagonal = covariance.diagonal(dim1=-2, dim2=-1)
+    scale = diagonal.clamp_min(1e-300).sqrt().where(diagonal > 0, 1e-150)
+    unit = (covariance / scale[..., :, None] / scale[..., None, :]).where(doubtful[..., None, None], 0.0)
+    values, vectors = torch.linalg.eigh((unit + unit.mT) / 2)
+    least = _ROUNDING * covariance.shape[-1] * values[..., -1:].clamp_min(1e-300)
+    vectors = vectors * scale[..., :, None]
+    raised = (vectors * values.maximum(least)[..., None, :]) @ vectors.mT
+    return raised.where(doubtful[..., None, None], covariance)
+
+
+def propagated(jacobian: Tensor, covariance: Tensor) -> Tensor:
+    """The covariances ``J C J^T`` (..., k, k) for Jacobians (..., k, K) and one covariance (K, K), without negative variances.
+
+    Example:
+        >>> propagated(torch.tensor([[1.0, -1.0]]), torch.tensor([[2.0, 1.0], [1.0, 2.0]])).item()
+        2.0
+    """
+    root, failed = torch.linalg.cholesky_ex(definite(covariance))
+    if int(failed):
+        return jacobian @ covariance @ jacobian.mT
+    half = jacobian @ root
+    return half @ half.mT
 
 
 def _directions(information: Tensor) -> tuple[Tensor, Tensor, Tensor]:

@@ -203,7 +203,8 @@ class Objective:
         at = self._unknowns_at(state, columns)
         deviations = torch.zeros_like(m.unknowns.by_camera(state.unknowns)).requires_grad_()
         step = torch.zeros_like(deviations).requires_grad_()
-        with torch.autograd.graph.allow_mutation_on_saved_tensors():  # an unknown of a user may write into a copy of a matrix
+        # copies: an unknown of a user may write into its own copy of a matrix
+        with torch.autograd.graph.saved_tensors_hooks(Tensor.clone, lambda saved: saved):
             moved = at.at(deviations)
             still = torch.zeros_like(points_cam)
             slope = loss.slope(points_cam, still, moved.pixels, information, moved.cameras, moved, step)

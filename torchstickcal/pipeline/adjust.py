@@ -310,25 +310,32 @@ def begin(
     return begun
 
 
-def begin_at_nearest_frames(adjustment: Adjustment, run: Run) -> Adjustment:
-    """One session from where it has ended, with the frames that are nearest in time by the time offsets found.
+def begin_at_nearest_frames(adjustment: Adjustment, run: Run, offsets_frames: Tensor | None = None) -> Adjustment:
+    """One session from where it has ended, with other frames, and time offsets among what is estimated.
+
+    Args:
+        adjustment: where the session has ended.
+        run: what all steps share.
+        offsets_frames: (C,), time offsets of the cameras' frames, in frames; None for those found.
 
     Raises:
         ObservationError: if no two cameras have a frame in common at these offsets.
     """
-    remaining = adjustment.remaining_offsets_frames
+    if offsets_frames is None:
+        offsets_frames = adjustment.frames[0].offsets_frames + adjustment.remaining_offsets_frames
+    refined = with_refinements(adjustment.refined, ("time_offset",))
     own = adjustment.seen.unknowns.by_name(adjustment.state.unknowns)
-    own["time_offset"] = torch.zeros_like(own["time_offset"])
+    own.pop("time_offset", None)
     state = adjustment.state
     start = WarmStart(
         state.rotations[0],
         state.translations[0],
         points=None,
-        unknowns=adjustment.seen.unknowns.of_cameras(own)[0],
+        unknowns=RigUnknowns.of(refined, adjustment.seen.cameras, run.config.camera_groups).of_cameras(own)[0],
         inliers=None,
         sigma_px=adjustment.last.sigma_px[0],
     )
-    return begin(adjustment.observations[0], run, adjustment.refined, adjustment.frames[0].offsets_frames + remaining, start)
+    return begin(adjustment.observations[0], run, refined, offsets_frames, start)
 
 
 def adjust_cameras(adjustment: Adjustment, run: Run, only_last: bool = False) -> Adjustment:

@@ -159,7 +159,7 @@ def calibration_steps(
     models = ModelSelection(observations, run, start)
 
     # 1. Synchronise: where the cameras' frames clearly do not belong together, find the time offsets.
-    clocks = models.searched() if "time_offset" in models.allowed and models.unsynchronised else None
+    clocks = models.clocks_unlike_given if "time_offset" in models.allowed else None
     begun = models.begun() if clocks is None else None
 
     # 2. Initialise rig and points, and 3. adjust them in stages, at the time offsets at which the views fit together best.
@@ -177,7 +177,7 @@ def calibration_steps(
 
     # 6. Conclude: covariance, and the result in the caller's dtype. Its quality is judged when it is first asked for.
     def unsynchronised() -> bool:
-        return config.synchronise and "time_offset" not in ended.refined and models.unsynchronised
+        return config.synchronise and "time_offset" not in ended.refined and models.clocks_unlike_given is not None
 
     run.took("total", time.perf_counter() - began)
     calibration = conclude(ended, check, clocks, unsynchronised, left_out, models.start_contradicted, run)

@@ -41,6 +41,9 @@ _ALIKE = 0.05
 """Relative difference of the decreases of the cost up to which two choices explain the keypoints equally well."""
 _STRAIGHT_FRAMES = 0.25
 """Time over which the motion of the keypoints may be taken as straight."""
+_FEW_PARTS = 6.0
+"""By how much a variance that only the scatter between the parts of the frames shows has to be larger to be as sure as one that
+is known: as Student's distribution of seven degrees of freedom demands at four standard deviations."""
 _LARGEST_LOSS = 0.1
 """What a choice may lose in the parts of the frames that it makes fit worse, as a share of what it gains in the others."""
 
@@ -136,7 +139,7 @@ class CameraCheck:
 
         Of the choices that explain the keypoints about equally well, and better than all others, it is the one with the fewest
         unknowns. A worse explanation is never taken instead: it would be an excuse for what the better one says. The choice
-        has to be needed and to predict (:meth:`confirms`), unless clocks are so far off that this is only seen after a trial.
+        has to be needed and to predict (:meth:`confirms`).
 
         Args:
             allowed: what may be refined.
@@ -150,13 +153,25 @@ class CameraCheck:
                 gains[names] = self._gain(names)
         clear, best = _SIGMAS**2, max(gains.values(), default=0.0)
         least = max(clear, best - max(clear, _ALIKE * best))
-        clocks_as_given = not clock_refinements() & set(refined)
         alike = [names for names, gain in gains.items() if gain > least]
         for names in sorted(alike, key=lambda names: (len(self._solved(names).values), -gains[names])):
-            far = clocks_as_given and self._is_far_in_time(names)
-            if far or (self._is_needed(names) and self._predicts(names)):
+            if self._is_needed(names) and self._predicts(names):
                 return names
         return ()
+
+    def may_be_far_in_time(self, allowed: Collection[str]) -> bool:
+        """Whether the keypoints ask for clocks so far off that the motion is not straight; how far is then not known here.
+
+        Args:
+            allowed: what may be refined.
+        """
+        for names in _choices():
+            if set(names) <= set(allowed) & clock_refinements() and self._gain(names) > _SIGMAS**2:
+                unknowns, values, _ = self._solved(names)
+                offsets = [values[columns] for name, columns in unknowns.columns.items() if name == "time_offset"]
+                if any(bool((own.abs() > _STRAIGHT_FRAMES).any()) for own in offsets):
+                    return True
+        return False
 
     def confirms(self, names: tuple[str, ...], deviations: Mapping[str, Tensor]) -> bool:
         """Whether a choice that has been refined here is needed and predicts.
@@ -197,9 +212,10 @@ class CameraCheck:
         return all(_is_far(values[own], usual[own][:, own]) for own in unknowns.columns.values())
 
     def _inflation(self, names: tuple[str, ...]) -> float:
-        """How much larger the variances of a choice's values are than those stated, by the scatter between parts of the frames.
+        """How much larger a choice's variances may be than those stated, by the scatter between parts of the frames.
 
         Errors that several points or cameras have in common in a frame are alike. That is seen here, not in any point's track.
+        A few parts do not show a variance well, so what they add to the stated one counts more.
         """
         folds, _ = self._folds
         if not folds:
@@ -207,13 +223,8 @@ class CameraCheck:
         chosen, unknowns = self._chosen(names)
         without = torch.stack([solve_information(*self._without(fold, chosen)) for fold in folds])[:, -unknowns.count :]
         jackknife = (len(folds) - 1) * without.var(0, correction=0)
-        return max(1.0, float((jackknife / self._solved(names).covariance.diagonal()).mean()))
-
-    def _is_far_in_time(self, names: tuple[str, ...]) -> bool:
-        """Whether a choice has clocks that are farther off than the motion of the keypoints is straight."""
-        unknowns, values, _ = self._solved(names)
-        clocks = [columns for name, columns in unknowns.columns.items() if all_unknowns()[name].family == "clock"]
-        return any(bool((values[columns].abs() > _STRAIGHT_FRAMES).any()) for columns in clocks)
+        ratio = float((jackknife / self._solved(names).covariance.diagonal()).mean())
+        return 1.0 + _FEW_PARTS * max(0.0, ratio - 1.0)
 
     def _predicts(self, names: tuple[str, ...], values: Tensor | None = None) -> bool:
         """Whether a choice, found without some frames or without some points, makes these fit better, beyond doubt.

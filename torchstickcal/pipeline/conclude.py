@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from torchstickcal.config import Config
+from torchstickcal.geometry.singular import definite
 from torchstickcal.model.correlation import error_correlation
 from torchstickcal.model.unknowns import CameraUnknown, RigEstimate, all_unknowns
 from torchstickcal.pipeline.adjust import Adjustment
@@ -49,7 +50,7 @@ def conclude(
     points = measurements.by_frame(ended.state.points[0]).where(inliers.any(0), torch.nan).movedim(0, -1)
     cameras = measurements.cameras_at(ended.state).to(torch.float64)[0]
     evidence = evidence_of(ended, check, run.config, clocks, unsynchronised, left_out, start_contradicted)
-    covariance, unknowns = evidence.noise + evidence.ruler, evidence.unknowns
+    covariance, unknowns = definite(evidence.noise + evidence.ruler), evidence.unknowns
     tangents = 6 * (measurements.num_cameras - 1)
     ends = torch.tensor([stick.ends for stick in observations.sticks], dtype=torch.long).view(-1, 2)
     size, count = observations.image_size, observations.num_cameras

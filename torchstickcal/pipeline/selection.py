@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import partial
 
-import torch
 from torch import Tensor
 
 from torchstickcal.errors import ObservationError, RigError
@@ -24,7 +24,7 @@ from torchstickcal.pipeline.adjust import (
 )
 from torchstickcal.pipeline.check import CameraCheck
 from torchstickcal.pipeline.run import Run
-from torchstickcal.pipeline.synchronise import ClockEstimate, on_common_frames, search_offsets, unsynchronised
+from torchstickcal.pipeline.synchronise import ClockEstimate, clocks_unlike_given, on_common_frames, search_offsets
 
 _MAX_STARTS = 3
 _MOST_TRIALS = 3
@@ -58,6 +58,7 @@ class ModelSelection:
 
     def __init__(self, observations: Observations, run: Run, start: tuple[Tensor, Tensor] | None = None) -> None:
         self._observations, self._run, self._start = observations, run, start
+        self._begun: dict[bool, Adjustment] = {}
         self.start_contradicted = False
         """whether the poses to start from were given up, because others fit the keypoints and they do not"""
         config = run.config
@@ -76,18 +77,14 @@ class ModelSelection:
             )
 
     @cached_property
-    def unsynchronised(self) -> bool:
-        """Whether the cameras' frames clearly do not belong together as given, by the motion in the images."""
-        return "time_offset" in self._refinable and unsynchronised(*self._keypoints_and_reach)
-
-    def searched(self) -> ClockEstimate:
-        """The time offsets, by the motion in the images."""
-        return search_offsets(*self._keypoints_and_reach)
+    def clocks_unlike_given(self) -> ClockEstimate | None:
+        """The time offsets where the cameras' frames clearly do not belong together as given, by the motion in the images."""
+        return clocks_unlike_given(*self._keypoints_and_reach) if "time_offset" in self._refinable else None
 
     def begun(self) -> Adjustment | None:
         """At the given time offsets, with the first estimate of rig and points; None where the cameras are no one rig there."""
         try:
-            return begin(self._observations, self._run, self._named_lenses, poses=self._start)
+            return self._begun_as_given()
         except RigError:
             return None
 
@@ -138,11 +135,12 @@ class ModelSelection:
         failure: RigError | None = None
         if not any(map(_fits, found)):
             try:
-                found.append(self._at_nearest_frames(first) if first else self._adjusted_at(self._named_lenses))
+                first = first or adjust_cameras(self._begun_as_given(), self._run)
+                found.append(self._at_nearest_frames(first))
             except RigError as error:
                 failure = error
         if clocks is None and "time_offset" in self.allowed and not any(map(_fits, found)):
-            clocks = self.searched()
+            clocks = search_offsets(*self._keypoints_and_reach)
             found += self._at_offsets(clocks)
         if not found and failure is not None:
             raise failure
@@ -152,36 +150,47 @@ class ModelSelection:
         """Adjusted with what the keypoints contradict of the cameras, the most contradicted first, and checked again.
 
         What was found is kept only if it fits better and is still needed there: the check is about the first step, and the
-        adjustment may end elsewhere. Where the given cameras do not converge, nothing more is estimated.
+        adjustment may end elsewhere. Where the given cameras do not converge, nothing more is estimated. Where clocks may be so
+        far off that the check cannot say how far, the motion in the images does.
         """
+        if not adjusted.converged:
+            return adjusted, check
+        if "time_offset" not in adjusted.refined and check.may_be_far_in_time(self.allowed):
+            for offsets in search_offsets(*self._keypoints_and_reach).alternatives:
+                elsewhere = adjust_cameras(begin_at_nearest_frames(adjusted, self._run, offsets), self._run, only_last=True)
+                if (confirmed := self._confirmed(("time_offset",), self._at_nearest_frames(elsewhere), adjusted)) is not None:
+                    adjusted, check = confirmed
+                    break
         failed: list[tuple[str, ...]] = []
-        for _ in range(_MOST_TRIALS if adjusted.converged else 0):
+        for _ in range(_MOST_TRIALS):
             choice = check.wanted(self.allowed, adjusted.refined, failed)
             if not choice:
                 break
             refined = self._with(adjusted, with_refinements(adjusted.refined, choice))
-            refined_check = CameraCheck(refined, self._run.config.camera_groups) if refined.converged else None
-            if (
-                refined_check is not None
-                and _median_squared_residual(refined) <= _BY_CHANCE * _median_squared_residual(adjusted)
-                and refined_check.confirms(choice, refined.deviations)
-            ):
-                adjusted, check = refined, refined_check
+            if (confirmed := self._confirmed(choice, refined, adjusted)) is not None:
+                adjusted, check = confirmed
             else:
                 failed.append(refined.refined)
         return adjusted, check
 
-    def _at_offsets(self, clocks: ClockEstimate) -> list[Adjustment]:
-        """Adjusted at the likeliest offsets, and where not all are certain, also at the certain ones alone.
+    def _confirmed(
+        self, choice: tuple[str, ...], refined: Adjustment, before: Adjustment
+    ) -> tuple[Adjustment, CameraCheck] | None:
+        """An adjustment with a choice refined, and its check; None if it does not fit better or the choice is not needed."""
+        if not refined.converged or _median_squared_residual(refined) > _BY_CHANCE * _median_squared_residual(before):
+            return None
+        check = CameraCheck(refined, self._run.config.camera_groups)
+        return (refined, check) if check.confirms(choice, refined.deviations) else None
 
-        Only those at which the views clearly fit together better than at the given times; a first adjustment says so soon.
+    def _at_offsets(self, clocks: ClockEstimate) -> list[Adjustment]:
+        """Adjusted at those of the offsets at which the views clearly fit together better than at the given times.
+
+        A first adjustment says so soon.
         """
-        candidates = [clocks.likeliest_frames, *([] if all(clocks.determined) else [clocks.offsets_frames])]
-        candidates = [offsets for offsets in candidates if bool(offsets.round().any())]
-        given = self._first_residual(torch.zeros_like(clocks.offsets_frames)) if candidates else 0.0
+        given = self._first_residual(self._begun_as_given) if clocks.alternatives else 0.0
         found: list[Adjustment] = []
-        for offsets in candidates:
-            if self._first_residual(offsets.round()) > _CLEARLY_BETTER * given:
+        for offsets in clocks.alternatives:
+            if self._first_residual(partial(self._begun_at, self._named_lenses, offsets.round())) > _CLEARLY_BETTER * given:
                 continue
             try:
                 found.append(self._adjusted_at(with_refinements(self.named, ("time_offset",)), offsets))
@@ -189,14 +198,12 @@ class ModelSelection:
                 continue
         return found
 
-    def _first_residual(self, offsets_frames: Tensor) -> float:
-        """Median squared residual after the first stage at time offsets (C,), square pixels; infinite where there is no rig."""
+    def _first_residual(self, begun: Callable[[], Adjustment]) -> float:
+        """Median squared residual after the first stage from a beginning, square pixels; infinite where there is no rig."""
         config = self._run.config
         first = Run(replace(config, stages=dict(list(config.stages.items())[:1]), relabel=False))
         try:
-            return _median_squared_residual(
-                adjust_cameras(begin(self._observations, first, self._named_lenses, offsets_frames), first)
-            )
+            return _median_squared_residual(adjust_cameras(begun(), first))
         except (RigError, ObservationError):
             return math.inf
 
@@ -205,10 +212,20 @@ class ModelSelection:
         """What the configuration refines of the lenses."""
         return [name for name in self.named if name not in clock_refinements()]
 
-    def _adjusted_at(self, refined: Sequence[str], offsets_frames: Tensor | None = None) -> Adjustment:
-        """Initialised and adjusted at some time offsets (C,) of the cameras, in frames; None for those given."""
-        begun = begin(self._observations, self._run, refined, offsets_frames, poses=self._start)
-        return self._at_nearest_frames(adjust_cameras(begun, self._run))
+    def _begun_as_given(self) -> Adjustment:
+        """Initialised at the given time offsets, once for each start."""
+        started = self._start is not None
+        if started not in self._begun:
+            self._begun[started] = self._begun_at(self._named_lenses)
+        return self._begun[started]
+
+    def _begun_at(self, refined: Sequence[str], offsets_frames: Tensor | None = None) -> Adjustment:
+        """Initialised at some time offsets (C,) of the cameras, in frames; None for those given."""
+        return begin(self._observations, self._run, refined, offsets_frames, poses=self._start)
+
+    def _adjusted_at(self, refined: Sequence[str], offsets_frames: Tensor) -> Adjustment:
+        """Initialised and adjusted at some time offsets (C,) of the cameras, in frames."""
+        return self._at_nearest_frames(adjust_cameras(self._begun_at(refined, offsets_frames), self._run))
 
     def _with(self, adjustment: Adjustment, refined: Sequence[str]) -> Adjustment:
         """Adjusted from where an adjustment has ended, with more refined."""

@@ -22,7 +22,7 @@ from torchstickcal.pipeline.relabel import Labels
 from torchstickcal.pipeline.run import Run
 from torchstickcal.pipeline.stage import run_stage
 from torchstickcal.pipeline.start import cameras_of
-from torchstickcal.pipeline.synchronise import on_common_frames, search_offsets, unsynchronised
+from torchstickcal.pipeline.synchronise import clocks_unlike_given, on_common_frames
 from torchstickcal.quality.evidence import Evidence
 from torchstickcal.quality.findings.keypoints import keypoints as keypoint_findings
 from torchstickcal.reconstruction import Reconstruction
@@ -146,8 +146,8 @@ def _reconstructed(observations: Observations, poses: tuple[Tensor, Tensor], cov
         frames = on_common_frames(observations)
         assert frames.rate_hz is not None
         seen, reach = measured(frames, config), config.max_offset_s * frames.rate_hz
-        if unsynchronised(seen, reach):
-            offsets = search_offsets(seen, reach).likeliest_frames.to(observations.keypoints.device)
+        if (other := clocks_unlike_given(seen, reach)) is not None:
+            offsets = other.likeliest_frames.to(observations.keypoints.device)
     adjusted, clocks = _placed(observations, poses, run, robust, covariance, offsets, timed)
     for _ in range(_STARTS - 1):
         if clocks is None or not bool((clocks.offsets_frames.abs() > _FAR_FRAMES).any()):

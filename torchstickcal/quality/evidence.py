@@ -122,6 +122,18 @@ class Evidence:
         return (kept / seen.clamp_min(1)).where(seen > 0, 1.0)
 
     @cached_property
+    def uneven(self) -> Tensor:
+        """(C,), standard deviation between a camera's points of the share of their keypoints that agree, beyond chance.
+
+        A detector that fails now and then is wrong at any point. A camera that shows something else agrees at some points,
+        which hardly move, and not at others.
+        """
+        seen, kept = (m.by_frame(m.visible[0]).sum(1).double() for m in (self.measurements, self.kept))
+        share = (kept.sum(-1) / seen.sum(-1).clamp_min(1))[:, None]
+        squared = (kept - share * seen).square() - seen * share * (1 - share)
+        return (squared.sum(-1) / seen.square().sum(-1).clamp_min(1)).clamp_min(0.0).sqrt()
+
+    @cached_property
     def doubtful(self) -> Tensor:
         """(C,), whether clearly fewer keypoints of a camera agree than of the others."""
         return (self.agreement < DOUBTFUL_SHARE) & (self.agreement < _BEHIND_OTHERS * self.agreement.median())

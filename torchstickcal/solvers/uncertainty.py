@@ -15,7 +15,7 @@ from torch import Tensor
 
 from torchstickcal.geometry import se3
 from torchstickcal.geometry.cameras import Intrinsics
-from torchstickcal.geometry.singular import covariance_root
+from torchstickcal.geometry.singular import covariance_root, definite, propagated
 from torchstickcal.geometry.symmetric import backward, cholesky, forward
 from torchstickcal.losses import Loss, ReprojectionLoss, StickLengthLoss
 from torchstickcal.model.correlation import ErrorCorrelation
@@ -65,7 +65,7 @@ def camera_covariance(
     if correlation is None or not correlation.lasts:
         return root @ root.mT
     times = torch.ones_like(correlation.times) if times is None else times
-    return root @ inflation(objective, state, root, correlation, times) @ root.mT
+    return definite(root @ inflation(objective, state, root, correlation, times) @ root.mT)
 
 
 def ruler_covariance(measurements: Measurements, state: State, sigma_px: Tensor) -> Tensor:
@@ -130,8 +130,8 @@ def point_variances(measurements: Measurements, state: State, sigma_px: Tensor) 
 def centre_covariances(centres: Tensor, covariance: Tensor) -> Tensor:
     """Covariances (C, 3, 3) of camera centres (C, 3), square metres, from the covariance of the tangents. Zero for camera 0."""
     jacobian = -_point_jacobian(centres[1:])
-    blocks = covariance.unflatten(0, (-1, 6)).unflatten(2, (-1, 6)).diagonal(dim1=0, dim2=2).movedim(-1, 0)
-    return torch.nn.functional.pad(jacobian @ blocks @ jacobian.mT, (0, 0, 0, 0, 1, 0))
+    of_all = torch.stack([torch.nn.functional.pad(own, (6 * c, len(covariance) - 6 * c - 6)) for c, own in enumerate(jacobian)])
+    return torch.nn.functional.pad(propagated(of_all, covariance), (0, 0, 0, 0, 1, 0))
 
 
 def relative_scale_std(centres: Tensor, covariance: Tensor) -> Tensor:
@@ -141,7 +141,7 @@ def relative_scale_std(centres: Tensor, covariance: Tensor) -> Tensor:
     """
     arms = centres[1:] - centres[0]
     jacobian = -(arms[:, None] @ _point_jacobian(centres[1:])).flatten() / arms.square().sum()
-    return (jacobian @ covariance @ jacobian).clamp_min(0.0).sqrt()
+    return propagated(jacobian[None], covariance)[0, 0].sqrt()
 
 
 def point_covariances(
@@ -158,7 +158,7 @@ def point_covariances(
         covariance: covariance of the cameras' tangents, (6 (C - 1), 6 (C - 1)).
     """
     _, triangulation, by_tangents = triangulation_terms(points, visible, sigma_px, poses, cameras)
-    return triangulation + by_tangents @ covariance @ by_tangents.mT
+    return triangulation + propagated(by_tangents, covariance)
 
 
 def triangulation_terms(

@@ -14,6 +14,9 @@ from torchstickcal.geometry.cameras import Intrinsics, PixelMap
 from torchstickcal.model.unknowns.base import CameraUnknown, ClockUnknown, ImageMotion, Sharing, View
 from torchstickcal.model.unknowns.registered import REFINEMENTS
 
+_IN_COMMON = 0.5
+"""Share of the variance of calibrated values that the cameras of a rig have in common: one target, one way of calibrating."""
+
 
 @dataclass(frozen=True)
 class RigUnknowns:
@@ -128,11 +131,12 @@ class RigUnknowns:
 
     @property
     def usual_sigma(self) -> Tensor:
-        """Standard deviations (B, K) of calibrated values around the truth; smaller for means of several cameras."""
+        """Standard deviations (B, K) of calibrated values around the truth; a little smaller for means of several cameras."""
         usual = torch.zeros_like(self.prior_sigma)
         for unknown in self.unknowns:
             usual[:, self.columns[unknown.name]] = unknown.usual_prior_share
-        return usual * self.prior_sigma / self.share.sum((0, 1)).sqrt()
+        in_mean = _IN_COMMON + (1 - _IN_COMMON) / self.share.sum((0, 1))
+        return usual * self.prior_sigma * in_mean.sqrt()
 
     def applied(self, cameras: Intrinsics, values: Tensor) -> Intrinsics:
         """The cameras at values (B, K)."""

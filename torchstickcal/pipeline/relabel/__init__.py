@@ -26,6 +26,8 @@ _CONTRADICTING_SHARE, _FAR_SHARE = 0.5, 0.05
 residual as a share of the body's root mean square size."""
 _LARGEST_OTHER_SHARE = 0.6
 """Of a camera's frames: a camera that shows another person in more is none that agrees with the others."""
+_LEAST_SHARE = 0.01
+"""Share of wrong keypoints, and of right ones, that is never ruled out."""
 _SUSPICIOUS_SHARE = 0.3
 """Share of the keypoints of an exchange that must contradict the points for a camera's frame to be looked at."""
 _MEASURED_FRAMES = 2000
@@ -148,7 +150,7 @@ def mended(
     frames = residuals.contradicting.any(0).nonzero()[:, 0]
     if len(frames) and measurements.num_cameras > 2:
         other = torch.zeros_like(residuals.contradicting)
-        other[:, frames] = other_persons(RayViews.of(measurements, state, sigma_px, frames))
+        other[:, frames] = other_persons(RayViews.of(measurements, state, sigma_px, frames), residuals.right_share)
         other &= residuals.contradicting
         seen = residuals.visible.any(-1)
         other &= (other.sum(-1) <= _LARGEST_OTHER_SHARE * seen.sum(-1))[:, None]
@@ -180,9 +182,21 @@ class _Residuals:
         return _Residuals(squared.where(visible, 0.0), visible, pixels, _noise(squared, visible))
 
     @property
+    def gross(self) -> Tensor:
+        """(C, F, P), True where a keypoint is far from its point, compared with its noise."""
+        return self.squared > (_GROSS_SIGMAS * self.sigma_px).square()
+
+    @property
+    def right_share(self) -> Tensor:
+        """(C,), share of each camera's keypoints that are near their points in the frames in which most are."""
+        counted = self.visible & ~self.contradicting[..., None]
+        right = (counted & ~self.gross).sum((1, 2)) / counted.sum((1, 2)).clamp_min(1)
+        return right.double().clamp(_LEAST_SHARE, 1 - _LEAST_SHARE)
+
+    @property
     def contradicting(self) -> Tensor:
         """(C, F), True where most keypoints of a camera are far from their points, compared with the size of the body."""
-        gross = self.squared > (_GROSS_SIGMAS * self.sigma_px).square()
+        gross = self.gross
         many = gross.sum(-1) > _CONTRADICTING_SHARE * self.visible.sum(-1)
         if not many.any():
             return many

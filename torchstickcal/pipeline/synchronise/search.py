@@ -7,6 +7,7 @@ matrices: neither extrinsics nor camera matrices are needed, only the distortion
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable
 from dataclasses import dataclass
 from itertools import combinations
@@ -43,6 +44,10 @@ _MIN_LOG_DIFFERENCE = 0.3
 """Difference of :func:`_log_unexplained` above which another lag is better. It is below 0.05 for synchronised cameras and
 above 1 for cameras that are whole frames apart."""
 
+_CLEARLY_LESS = math.log(2.0)
+"""Difference of :func:`_log_unexplained` by which most pairs of cameras have to fit better at other offsets: half as much is
+left unexplained. A camera with poor keypoints fits a little better at some of many lags by chance, but not with most others."""
+
 Fits = dict[tuple[int, int], EpipolarFit]
 """Epipolar residuals of all pairs of cameras."""
 
@@ -59,6 +64,8 @@ class ClockEstimate:
     """whether the motion determines the offset of a camera; True for camera 0"""
     reasons: tuple[str, ...]
     """why a camera's offset is undetermined; empty if it is determined"""
+    alternatives: tuple[Tensor, ...]
+    """those of the time offsets above, (C,), at which most pairs of cameras fit together clearly better than at those given"""
 
 
 def search_offsets(measurements: Measurements, max_offset_frames: float, noise_px: float = 2.0) -> ClockEstimate:
@@ -75,20 +82,33 @@ def search_offsets(measurements: Measurements, max_offset_frames: float, noise_p
     pixels, weights = _image_tracks(measurements, max_offset, noise_px)
     tracks = Tracks(pixels, weights, min(2 * max_offset, pixels.shape[2] - 1))
     fits, scores, offsets = _search(tracks, max_offset, noise_px)
+    of_all_keypoints = fits
     for _ in range(_ROUNDS - 1):
         tracks = Tracks(pixels, tracks.weights * _epipolar_inliers(tracks, offsets, noise_px), int(tracks.lags[-1]))
         fits, scores, offsets = _search(tracks, max_offset, noise_px)
     reasons = _reasons_for_doubt(fits, scores, offsets, max_offset)
     determined = tuple(not reason for reason in reasons)
     refined = _subframe_offsets(fits, offsets, determined)
-    return ClockEstimate(refined, refined.where(torch.tensor(determined), offsets.double()), determined, reasons)
+    likeliest = refined.where(torch.tensor(determined), offsets.double())
+    candidates = [likeliest, *([] if all(determined) else [refined])]
+    alternatives = tuple(offsets for offsets in candidates if _fit_clearly_better(of_all_keypoints, offsets.round(), noise_px))
+    return ClockEstimate(refined, likeliest, determined, reasons, alternatives)
 
 
-def unsynchronised(measurements: Measurements, max_offset_frames: float, noise_px: float = 2.0) -> bool:
-    """Whether some camera fits camera 0 clearly better at another lag than at lag 0.
+def clocks_unlike_given(measurements: Measurements, max_offset_frames: float, noise_px: float = 2.0) -> ClockEstimate | None:
+    """The time offsets where the cameras' frames clearly do not belong together as given; None where they do.
 
-    It is much faster than :func:`search_offsets`, which has the same arguments.
+    Where no camera fits camera 0 better at another lag, it takes much less time than :func:`search_offsets`. The arguments are
+    the same.
     """
+    if not _doubtful(measurements, max_offset_frames, noise_px):
+        return None
+    found = search_offsets(measurements, max_offset_frames, noise_px)
+    return found if found.alternatives else None
+
+
+def _doubtful(measurements: Measurements, max_offset_frames: float, noise_px: float) -> bool:
+    """Whether some camera fits camera 0 better at another lag than at lag 0."""
     max_offset = int(min(max_offset_frames + 1, measurements.frames - 1))
     pixels, weights = _image_tracks(measurements, max_offset, noise_px)
     tracks = Tracks(pixels, weights, min(max_offset, pixels.shape[2] - 1))
@@ -217,6 +237,18 @@ def _epipolar_inliers(tracks: Tracks, offsets: Tensor, noise_px: float) -> Tenso
                 compared[camera, frames] |= common
                 agrees[camera, frames] |= close
     return agrees | ~compared
+
+
+def _fit_clearly_better(fits: Fits, offsets: Tensor, noise_px: float) -> bool:
+    """Whether most pairs of cameras whose frames meet others at some offsets (C,), whole frames, fit clearly better there."""
+    decreases = []
+    for (i, j), fit in fits.items():
+        lag, zero = int(offsets[i] - offsets[j]), len(fit.points) // 2
+        if lag and 0 <= zero + lag < len(fit.points):
+            unexplained = _log_unexplained(fit, noise_px)
+            decreases.append(float(unexplained[zero].nan_to_num(nan=torch.inf) - unexplained[zero + lag]))
+    known = sorted(decrease for decrease in decreases if not math.isnan(decrease))
+    return bool(known) and known[(len(known) - 1) // 2] > _CLEARLY_LESS
 
 
 def _reasons_for_doubt(fits: Fits, scores: Tensor, offsets: Tensor, max_offset: int) -> tuple[str, ...]:

@@ -13,6 +13,10 @@ from torchstickcal.quality.registry import findings
 
 _AGREEING_SHARE = 0.55
 """Sound cameras keep 84 % of their keypoints and more, with 20 % of wrong ones 66 %; mirrored or alien ones 27 to 43 %."""
+_EVENLY, _LIKE_OTHERS = 0.25, 0.8
+"""Largest standard deviation between points of the share that agrees, of cameras whose keypoints are often wrong and not of
+something else: those have up to 0.15, mirrored, alien and late ones 0.35 and more. And their least share, relative to the
+median of all cameras."""
 _SAME_VIEW_RAD = 0.005
 """Mean angle between the rays of two cameras to the same points, below which they see one and the same view."""
 _LEAST_PARALLAX_DEG = 3.0
@@ -69,6 +73,16 @@ def _shares(evidence: Evidence) -> Iterator[Finding]:
                 Severity.FATAL,
                 f"{name}: {left} of {own} keypoints agree with the other cameras, so that nothing is known of where it is.",
                 "Check that it shows the same athlete at the same time, and that its intrinsics are right.",
+                limit=_AGREEING_SHARE,
+                **common,
+            )
+        elif share < _AGREEING_SHARE and float(evidence.uneven[camera]) < _EVENLY and share > _LIKE_OTHERS * median:
+            yield Finding(
+                "camera_contradicts",
+                Severity.CAUTION,
+                f"{name}: only {100 * share:.0f} % of its keypoints agree with the other cameras. The others are spread over "
+                "all points, as those of a detector that often fails.",
+                "Look at its video with the keypoints drawn into it.",
                 limit=_AGREEING_SHARE,
                 **common,
             )
