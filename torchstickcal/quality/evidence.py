@@ -11,6 +11,7 @@ from torch import Tensor
 from torchstickcal.config import Config
 from torchstickcal.geometry import se3
 from torchstickcal.lazy import cached_property
+from torchstickcal.model.correlation import error_correlation
 from torchstickcal.model.measurements import Measurements
 from torchstickcal.model.state import State
 from torchstickcal.model.unknowns import all_unknowns
@@ -227,10 +228,33 @@ class Evidence:
         """The most evident change of a camera's pose during the session; None where nothing can be said."""
         if self.cameras < 2 or not bool(self.kept.active.any()):
             return None
+        found = self._motion_among(torch.ones_like(self.sigma_px))
+        if found is None or found.evidence < found.least:
+            return found
+        times = self._varying_times
+        return self._motion_among(times) if bool((times > 1).any()) else found
+
+    def _motion_among(self, times: Tensor) -> Motion | None:
+        """The same, where of each point as many keypoints as ``times`` (P,) count as one."""
         m = self.measurements
-        varying = replace(m, pixels=m.pixels + self.constant_errors_px.to(m.pixels).repeat(1, 1, m.frames))
+        pixels = m.pixels + self.constant_errors_px.to(m.pixels).repeat(1, 1, m.frames)
+        varying = replace(m, pixels=pixels, confidence=(m.by_frame(m.confidence) / times.to(m.confidence)).flatten(-2))
         pulls = FramePulls.of(varying, self.state, self.ended.last.sigma_px)
         return motion_of(pulls, self.state.rotations[0], self.state.translations[0])
+
+    @cached_property
+    def _varying_times(self) -> Tensor:
+        """(P,), as many keypoints of a point are worth one: for how many frames their errors last, beside those that are always
+        the same, and those that all points of a camera share, as if it had moved."""
+        m = self.kept
+        pixels = m.pixels.clone()
+        for columns, residuals, _ in m.residuals(self.state):
+            seen = m.visible[0][:, None, columns].unflatten(-1, (-1, m.points_per_frame))
+            errors = residuals[0].unflatten(-1, seen.shape[-2:]).where(seen, 0.0)
+            shared = errors.sum(-1, keepdim=True) / seen.sum(-1, keepdim=True).clamp_min(1)
+            pixels[0, :, :, columns] += shared.expand_as(errors).flatten(-2)
+        alone = replace(m, pixels=pixels)
+        return error_correlation(alone, self.state, self.ended.last.sigma_px).varying_times[0]
 
     @cached_property
     def contradictions(self) -> dict[str, Tensor]:
