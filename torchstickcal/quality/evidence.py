@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import torch
@@ -40,6 +40,8 @@ _SAID_BY_IMAGES = 2.0
 """Factor of the evidence against the clocks where the motion in the images, by itself, speaks against them too."""
 CONSTANT_SIGMAS = 0.5
 """Errors that are always the same, over the noise, from which on they matter."""
+_LARGEST_SIGMAS = 6.0
+"""Residual, in standard deviations, beyond which a point was lost."""
 _LEAST_FRAMES = 20
 """Least number of frames in which a camera sees a point, for the mean of its errors to be known."""
 _OTHER_PERSON_SHARE = 0.2
@@ -211,11 +213,20 @@ class Evidence:
         """(C, 2, P), mean residual of each point in each camera, pixels; 0 where it is seen in too few frames to tell."""
         m = self.kept
         sums = torch.zeros(self.cameras, 2, m.points_per_frame, dtype=torch.float64, device=m.pixels.device)
-        for columns, found, _ in m.residuals(self.state):
-            seen = m.visible[0][:, None, columns]
-            sums += found[0].double().where(seen, 0.0).unflatten(-1, (-1, m.points_per_frame)).sum(-2)
+        for _, errors, _ in self._errors_px:
+            sums += errors.sum(-2)
         count = m.by_frame(m.visible[0]).sum(1)[:, None]
         return (sums / count.clamp_min(1)).where(count >= _LEAST_FRAMES, 0.0)
+
+    @property
+    def _errors_px(self) -> Iterator[tuple[slice, Tensor, Tensor]]:
+        """Residuals (C, 2, f, P) of the keypoints that took part, 0 elsewhere, and which they are, (C, 1, f, P), by chunks of
+        columns. Large ones are those of a point that was lost, and are drawn in."""
+        m, largest = self.kept, _LARGEST_SIGMAS * self.sigma_px
+        for columns, residuals, _ in m.residuals(self.state):
+            seen = m.visible[0][:, None, columns].unflatten(-1, (-1, m.points_per_frame))
+            errors = residuals[0].double().unflatten(-1, seen.shape[-2:])
+            yield columns, errors.where(seen, 0.0).clamp(-largest, largest), seen
 
     @cached_property
     def constant_errors_sigmas(self) -> float:
@@ -248,11 +259,9 @@ class Evidence:
         the same, and those that all points of a camera share, as if it had moved."""
         m = self.kept
         pixels = m.pixels.clone()
-        for columns, residuals, _ in m.residuals(self.state):
-            seen = m.visible[0][:, None, columns].unflatten(-1, (-1, m.points_per_frame))
-            errors = residuals[0].unflatten(-1, seen.shape[-2:]).where(seen, 0.0)
+        for columns, errors, seen in self._errors_px:
             shared = errors.sum(-1, keepdim=True) / seen.sum(-1, keepdim=True).clamp_min(1)
-            pixels[0, :, :, columns] += shared.expand_as(errors).flatten(-2)
+            pixels[0, :, :, columns] += shared.expand_as(errors).flatten(-2).to(pixels)
         alone = replace(m, pixels=pixels)
         return error_correlation(alone, self.state, self.ended.last.sigma_px).varying_times[0]
 

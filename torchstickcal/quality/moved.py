@@ -62,7 +62,7 @@ class Motion(NamedTuple):
     gradual: bool
     """whether it went on during the whole session, rather than at once"""
     like_turn: bool
-    """whether a turn across the optical axis explains it as well, which is then the change: a shift across the axis looks alike"""
+    """whether a turn across the axis explains it as well, which is then the change; a shift across the axis looks alike"""
 
 
 def motion_of(pulls: FramePulls, rotations: Tensor, translations: Tensor) -> Motion | None:
