@@ -256,12 +256,17 @@ class Evidence:
     @cached_property
     def _varying_times(self) -> Tensor:
         """(P,), as many keypoints of a point are worth one: for how many frames their errors last, beside those that are always
-        the same, and those that all points of a camera share, as if it had moved."""
+        the same, and those by which the image of a camera is shifted and turned, as if it had moved."""
         m = self.kept
         pixels = m.pixels.clone()
         for columns, errors, seen in self._errors_px:
-            shared = errors.sum(-1, keepdim=True) / seen.sum(-1, keepdim=True).clamp_min(1)
-            pixels[0, :, :, columns] += shared.expand_as(errors).flatten(-2).to(pixels)
+            count = seen.sum(-1, keepdim=True).clamp_min(1)
+            places = m.pixels[0, :, :, columns].unflatten(-1, (-1, m.points_per_frame)).where(seen, 0.0)
+            x, y = (places - places.sum(-1, keepdim=True) / count).where(seen, 0.0).unbind(1)
+            turn = (x * errors[:, 1] - y * errors[:, 0]).sum(-1) / (x.square() + y.square()).sum(-1).clamp_min(1e-9)
+            turned = turn[:, None, :, None] * torch.stack([-y, x], dim=1)
+            shared = errors.sum(-1, keepdim=True) / count + turned
+            pixels[0, :, :, columns] += shared.flatten(-2).to(pixels)
         alone = replace(m, pixels=pixels)
         return error_correlation(alone, self.state, self.ended.last.sigma_px).varying_times[0]
 

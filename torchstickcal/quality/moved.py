@@ -5,8 +5,8 @@ and each frame, the change of pose from this frame on that the keypoints ask for
 (score test). The points, and the poses of all cameras, may follow. Errors that are alike from frame to frame make such pulls
 by themselves: the variance is estimated from blocks of frames, not taken from the noise of single keypoints.
 
-A knock moves the whole image: it is found as a turn across the optical axis, which has two numbers, also where the camera was
-shifted. The four other numbers of a change add more noise than evidence. They count only where they are strong.
+A knock moves the whole image: it is found as a turn of the camera about its centre, also where the camera was shifted. The
+other three numbers of a change add more noise than evidence. They count only where they are strong.
 """
 
 from __future__ import annotations
@@ -20,10 +20,10 @@ from torchstickcal.geometry import se3
 from torchstickcal.geometry.singular import covariance_of
 from torchstickcal.quality.linear import FramePulls, variance_of_sums
 
-LEAST_EVIDENCE, LEAST_EVIDENCE_OF_ANY = 22.0, 150.0
-"""Squared length of the change in its standard deviations, from which on a camera is said to have moved, where its image moved,
-and for a change of any kind. The first is where chance reaches it in less than 1 % of sound sessions: 2 numbers are fitted at
-the best of many frames and cameras. Measured on sound sessions, see docs/quality.md."""
+LEAST_EVIDENCE, LEAST_EVIDENCE_OF_ANY = 24.0, 150.0
+"""Squared length of the change in its standard deviations, from which on a camera is said to have moved: of a turn, and of a
+change of any kind. Chance reaches the first in less than 1 % of sound sessions, where 3 numbers are fitted at the best of many
+frames and cameras. Measured on sound sessions, see docs/quality.md."""
 _PRIOR_M, _PRIOR_RAD = 0.03, 0.02
 """A change is expected to be smaller than this; it keeps the test finite where a direction is not determined."""
 _LEAST_FRAMES = 12
@@ -35,9 +35,9 @@ _LEAST_VARIANCE = 0.6
 """Least variance of the pulls, over that of independent errors. Robust noise makes it 0.7; of keypoints without noise only
 rounding errors are left."""
 _CERTAIN = 0.95
-_NOT_A_TURN = 13.3
-"""Evidence that a change has beyond a turn of the camera across its axis, from which on it was no such turn: four more numbers
-have less by chance in 99 % of all sessions."""
+_NOT_A_TURN = 11.3
+"""Evidence that a change has beyond a turn of the camera, from which on it was no turn: three more numbers have less by chance
+in 99 % of all sessions."""
 
 
 class Motion(NamedTuple):
@@ -62,7 +62,7 @@ class Motion(NamedTuple):
     gradual: bool
     """whether it went on during the whole session, rather than at once"""
     like_turn: bool
-    """whether a turn across the axis explains it as well, which is then the change; a shift across the axis looks alike"""
+    """whether a turn explains it as well, which is then the change; a shift across the axis looks like a turn across it"""
 
 
 def motion_of(pulls: FramePulls, rotations: Tensor, translations: Tensor) -> Motion | None:
@@ -76,25 +76,25 @@ def motion_of(pulls: FramePulls, rotations: Tensor, translations: Tensor) -> Mot
     if pulls.parts < _LEAST_FRAMES:
         return None
     system = _System.of(pulls)
-    across = _turns_across(rotations, translations)
-    found = [_best_change(system, camera, across[camera]) for camera in range(len(rotations))]
+    poses = list(zip(rotations, translations, strict=True))
+    found = [_best_change(system, camera, _motions(*pose)) for camera, pose in enumerate(poses)]
     order = sorted(range(len(found)), key=lambda camera: -found[camera].strength)
     camera, best = order[0], found[order[0]]
-    rotation, translation = rotations[camera], translations[camera]
-    moved = se3.retract(rotation, translation, best.tangent)
-    shift = se3.camera_centres(*moved) - se3.camera_centres(rotation, translation)
+    like_turn = best.like_turn
+    tangent = best.asked.tangent(best.chosen, 3 if like_turn else 6)
+    before, after = poses[camera], se3.retract(*poses[camera], tangent)
     return Motion(
         camera=camera,
-        frame=pulls.first_frame(best.part),
+        frame=0 if best.gradual else pulls.first_frame(best.part),
         frame_error=round(best.part_error * len(pulls.part) / pulls.parts),
         evidence=best.strength * best.least,
         least=best.least,
         rival=found[order[1]].strength * best.least if len(found) > 1 else 0.0,
-        rotation_deg=float(best.tangent[3:].norm().rad2deg()),
-        shift_m=float(shift.norm()),
-        tangent=best.tangent,
+        rotation_deg=float(tangent[3:].norm().rad2deg()),
+        shift_m=float((se3.camera_centres(*after) - se3.camera_centres(*before)).norm()),
+        tangent=tangent,
         gradual=best.gradual,
-        like_turn=best.like_turn,
+        like_turn=like_turn,
     )
 
 
@@ -107,8 +107,6 @@ class _System(NamedTuple):
     """(K, 6 C, 6 C)"""
     covariance: Tensor
     """(6 C, 6 C), of the poses by all parts together"""
-    prior: Tensor
-    """(6, 6), information about a change that is there without any keypoints"""
 
     @staticmethod
     def of(pulls: FramePulls) -> _System:
@@ -117,58 +115,95 @@ class _System(NamedTuple):
         prior = pull.new_tensor([1 / _PRIOR_M**2] * 3 + [1 / _PRIOR_RAD**2] * 3).diag()
         covariance = covariance_of(information.sum(0) + torch.block_diag(*[1e-2 * prior] * cameras))
         common = covariance @ pull.sum(0).flatten()
-        return _System(pull - (information @ common).unflatten(1, (cameras, 6)), information, covariance, prior)
-
-
-class _Change(NamedTuple):
-    """The best change of one camera."""
-
-    strength: float
-    """evidence over the least that a change needs"""
-    least: float
-    part: int
-    part_error: int
-    tangent: Tensor
-    gradual: bool
-    like_turn: bool
+        return _System(pull - (information @ common).unflatten(1, (cameras, 6)), information, covariance)
 
 
 class _Asked(NamedTuple):
-    """Changes that n weighted sums of the pulls at one camera ask for."""
+    """Changes that n weighted sums of the pulls at one camera ask for: three turns about its centre, then three shifts."""
 
-    change: Tensor
-    """(n, 6), tangents"""
-    evidence_of_any: Tensor
-    """(n,), squared length of the change in its standard deviations"""
-    turn: Tensor
-    """(n, 6), the change that only turns the camera across its axis"""
-    evidence: Tensor
-    """(n,), the same of it"""
+    root: Tensor
+    """(n, 6, 6), Cholesky factor of the information about the change"""
+    pull: Tensor
+    """(n, 6), the pull in its standard deviations: of turns, and of what shifts have beyond turns"""
+    motions: Tensor
+    """(6, 6), tangents of the turns and shifts"""
 
     @staticmethod
-    def by(pull: Tensor, own: Tensor, rows: Tensor, system: _System, across: Tensor) -> _Asked:
+    def by(pull: Tensor, own: Tensor, rows: Tensor, system: _System, motions: Tensor) -> _Asked:
         """By sums of the pulls (n, 6), of the information about the camera (n, 6, 6), and about all of them (n, 6, 6 C)."""
-        left = own - rows @ system.covariance @ rows.mT
-        change = torch.linalg.solve(left + system.prior, pull[..., None])[..., 0]
-        own_pull = pull @ across
-        of_turns = across.mT @ left @ across + torch.eye(2).to(pull) / _PRIOR_RAD**2
-        angles = torch.linalg.solve(of_turns, own_pull[..., None])[..., 0]
-        return _Asked(-change, (pull * change).sum(-1), -angles @ across.mT, (own_pull * angles).sum(-1))
+        prior = pull.new_tensor([1 / _PRIOR_RAD**2] * 3 + [1 / _PRIOR_M**2] * 3).diag()
+        left = motions.mT @ (own - rows @ system.covariance @ rows.mT) @ motions + prior
+        root = torch.linalg.cholesky_ex(left).L
+        pulled = torch.linalg.solve_triangular(root, (pull @ motions)[..., None], upper=False)[..., 0]
+        return _Asked(root, pulled.nan_to_num(), motions)
+
+    @property
+    def of_turn(self) -> Tensor:
+        """(n,), squared length of the turn in its standard deviations."""
+        return self.pull[:, :3].square().sum(-1)
+
+    @property
+    def of_any(self) -> Tensor:
+        """(n,), the same of the whole change."""
+        return self.pull.square().sum(-1)
 
     @property
     def strength(self) -> Tensor:
         """(n,), evidence over the least that a change needs, without regard to lasting errors."""
-        return torch.maximum(self.evidence / LEAST_EVIDENCE, self.evidence_of_any / LEAST_EVIDENCE_OF_ANY)
+        return torch.maximum(self.of_turn / LEAST_EVIDENCE, self.of_any / LEAST_EVIDENCE_OF_ANY)
+
+    def tangent(self, index: int, size: int) -> Tensor:
+        """(6,), one of the changes: a turn for a size of 3, the whole change for 6."""
+        upper, pull = self.root[index, :size, :size].mT, self.pull[index, :size, None]
+        return -self.motions[:, :size] @ torch.linalg.solve_triangular(upper, pull, upper=True)[:, 0]
 
 
-def _turns_across(rotations: Tensor, translations: Tensor) -> Tensor:
-    """Tangents (C, 6, 2) that turn each camera about its centre, around the two axes of its image."""
-    axes = rotations[:, :2].mT
-    centres = se3.camera_centres(rotations, translations)
-    return torch.cat([torch.linalg.cross(centres[..., None].expand_as(axes), axes, dim=1), axes], dim=1)
+class _Change(NamedTuple):
+    """The best change of one camera: of those asked for, one of them."""
+
+    asked: _Asked
+    chosen: int
+    turned: bool
+    """whether it is found as a turn, rather than as a change of any kind"""
+    variance: float
+    """of the pulls, over that of independent errors"""
+    part: int
+    gradual: bool
+
+    @property
+    def least(self) -> float:
+        """The least evidence that it needs."""
+        return LEAST_EVIDENCE if self.turned else LEAST_EVIDENCE_OF_ANY
+
+    @property
+    def strength(self) -> float:
+        """Evidence over the least that it needs."""
+        return float(self.asked.strength[self.chosen]) / self.variance
+
+    @property
+    def like_turn(self) -> bool:
+        """Whether a turn explains it as well."""
+        return float((self.asked.of_any - self.asked.of_turn)[self.chosen]) < _NOT_A_TURN * self.variance
+
+    @property
+    def part_error(self) -> int:
+        """Parts by which it may be at another one, by the likelihood of the others; 0 for a drift."""
+        evidence = self.asked.of_turn if self.turned else self.asked.of_any
+        likelihood = torch.softmax(evidence / (2 * self.variance), dim=0)
+        distances = (torch.arange(len(evidence), device=evidence.device) - self.chosen).abs()
+        within = torch.zeros_like(likelihood).index_add_(0, distances, likelihood)
+        return int((within.cumsum(0) < _CERTAIN).sum())
 
 
-def _best_change(system: _System, camera: int, across: Tensor) -> _Change:
+def _motions(rotation: Tensor, translation: Tensor) -> Tensor:
+    """Tangents (6, 6) that turn a camera about its centre, around its own axes, and that shift it along them."""
+    axes = rotation.mT
+    centre = se3.camera_centres(rotation, translation)
+    turns = torch.cat([torch.linalg.cross(centre[:, None].expand_as(axes), axes, dim=0), axes])
+    return torch.cat([turns, torch.cat([axes, torch.zeros_like(axes)])], dim=1)
+
+
+def _best_change(system: _System, camera: int, motions: Tensor) -> _Change:
     """The best change of one camera: at once, before one of some parts, or gradually over the session."""
     place = slice(6 * camera, 6 * camera + 6)
     pull, rows = system.pull[:, camera], system.information[:, place]
@@ -176,38 +211,22 @@ def _best_change(system: _System, camera: int, across: Tensor) -> _Change:
     edge = max(2, round(_EDGE * parts))
     steps = torch.arange(edge, parts - edge + 1, device=pull.device)
     rows_after = _from(rows)[steps]
-    at_once = _Asked.by(_from(pull)[steps], rows_after[..., place], rows_after, system, across)
+    at_once = _Asked.by(_from(pull)[steps], rows_after[..., place], rows_after, system, motions)
     ramp = torch.linspace(-0.5, 0.5, parts).to(pull)
-    rows_along = torch.einsum("k,kij->ij", ramp, rows)[None]
-    squared = torch.einsum("k,kij->ij", ramp.square(), own)[None]
-    along = _Asked.by((ramp @ pull)[None], squared, rows_along, system, across)
-    best = int(at_once.strength.argmax())
-    gradual = float(along.strength[0]) > float(at_once.strength[best])
+    rows_along = (ramp @ rows.flatten(1)).view(1, 6, -1)
+    squared = (ramp.square() @ own.flatten(1)).view(1, 6, 6)
+    along = _Asked.by((ramp @ pull)[None], squared, rows_along, system, motions)
+    strength = at_once.strength
+    best = int(strength.argmax())
+    gradual = float(along.strength[0]) > float(strength[best])
     asked, index = (along, 0) if gradual else (at_once, best)
     share = ramp if gradual else (torch.arange(parts, device=pull.device) >= steps[best]).to(pull)
-    turns = float(asked.evidence[index]) / LEAST_EVIDENCE > float(asked.evidence_of_any[index]) / LEAST_EVIDENCE_OF_ANY
-    change = asked.turn[index] if turns else asked.change[index]
+    turned = float(asked.of_turn[index]) / LEAST_EVIDENCE > float(asked.of_any[index]) / LEAST_EVIDENCE_OF_ANY
+    change = asked.tangent(index, 3 if turned else 6)
     others = system.covariance @ ((rows_along[0] if gradual else rows_after[best]).mT @ change)
     explained = rows @ others - share[:, None] * (own @ change)
     variance = max(variance_of_sums(pull - explained, own, _BLOCKS), _LEAST_VARIANCE)
-    like_turn = float(asked.evidence_of_any[index] - asked.evidence[index]) < _NOT_A_TURN * variance
-    return _Change(
-        strength=float(asked.strength[index]) / variance,
-        least=LEAST_EVIDENCE if turns else LEAST_EVIDENCE_OF_ANY,
-        part=0 if gradual else int(steps[best]),
-        part_error=0 if gradual else _error(at_once.evidence if turns else at_once.evidence_of_any, best, variance),
-        tangent=asked.turn[index] if like_turn else asked.change[index],
-        gradual=gradual,
-        like_turn=like_turn,
-    )
-
-
-def _error(evidence: Tensor, best: int, variance: float) -> int:
-    """Places by which the best of some (n,) may be wrong, by the likelihood of the others."""
-    likelihood = torch.softmax(evidence / (2 * variance), dim=0)
-    distances = (torch.arange(len(evidence), device=evidence.device) - best).abs()
-    within = torch.zeros(len(evidence), dtype=evidence.dtype, device=evidence.device).index_add_(0, distances, likelihood)
-    return int((within.cumsum(0) < _CERTAIN).sum())
+    return _Change(asked, index, turned, variance, int(steps[best]), gradual)
 
 
 def _from(values: Tensor) -> Tensor:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator
 
 from torchstickcal.quality.evidence import Evidence
@@ -28,13 +27,15 @@ def motion(evidence: Evidence) -> Iterator[Finding]:
     if found.evidence < least:
         return
     name = evidence.camera(found.camera)
-    shift_m = _like_shift_m(evidence, found) if found.like_turn else found.shift_m
+    like_shift_m = _like_shift_m(evidence, found)
+    shift_m = like_shift_m if found.like_turn else found.shift_m
     harmless = found.rotation_deg < _HARMLESS_DEG and shift_m < _HARMLESS_SHARE * evidence.rig_m
     doubt = found.rival > _RIVAL_SHARE * found.evidence
     which = f"{name}, or a camera beside it," if doubt else name
     last = evidence.observations.num_frames - 1
     if found.like_turn:
-        amount = f"as if turned by {found.rotation_deg:.2g} degrees, or shifted by {1000 * shift_m:.2g} mm, across its axis"
+        like_shift = f", or shifted by {1000 * like_shift_m:.2g} mm across its axis" if like_shift_m else ""
+        amount = f"as if turned by {found.rotation_deg:.2g} degrees{like_shift}"
     else:
         amount = f"by {found.rotation_deg:.2g} degrees and {1000 * shift_m:.2g} mm"
     if found.gradual:
@@ -60,6 +61,9 @@ def motion(evidence: Evidence) -> Iterator[Finding]:
 
 
 def _like_shift_m(evidence: Evidence, found: Motion) -> float:
-    """The shift of a camera that moves its image as a turn does, at the distance of its points, metres."""
+    """The shift of a camera that moves its image as its turn does, at the distance of its points, metres; 0 for a turn that is
+    mostly about its axis, which no shift is like."""
+    turn = evidence.state.rotations[0, found.camera] @ found.tangent[3:]
+    across = float(turn[:2].norm())
     distances = (evidence.points - evidence.centres[found.camera][:, None, None]).norm(dim=0)
-    return math.radians(found.rotation_deg) * float(distances.nanmedian())
+    return across * float(distances.nanmedian()) if across > abs(float(turn[2])) else 0.0
