@@ -42,6 +42,17 @@ def decaying(points: int) -> ErrorCorrelation:
     return ErrorCorrelation(decay[None, :, None] ** torch.arange(FRAMES))
 
 
+def test_what_never_changes_does_not_count_among_the_errors_that_vary():
+    lags = torch.arange(100, dtype=torch.float64)
+    fading, constant = 0.9**lags, torch.where(lags == 0, 1.0, 0.4)
+    both = torch.where(lags == 0, 1.0, 0.4 + 0.3 * fading)
+    times = ErrorCorrelation(torch.stack([fading, constant, both])[None]).varying_times[0]
+    last = ErrorCorrelation(torch.stack([fading, constant, both])[None]).times[0]
+    torch.testing.assert_close(times[:2], torch.stack([last[0], torch.ones(()).double()]), rtol=0.05, atol=0.0)
+    torch.testing.assert_close(times[2], 1 + 0.3 * (last[0] - 1), rtol=0.05, atol=0.0)
+    assert float(last[1:].min()) > 30
+
+
 def objective_of(m: Measurements) -> Objective:
     sigma = torch.full((1, m.points_per_frame), SIGMA_PX, dtype=torch.float64)
     return Objective(m, {"reprojection": ReprojectionLoss(sigma[:, None, None]), "stick_length": StickLengthLoss(TOLERANCE_M)})

@@ -211,6 +211,16 @@ def test_every_keypoint_is_used_or_set_aside():
     assert sum(counts) + others == int(observations.visible.sum() - calibration.inliers.sum())
 
 
+@pytest.mark.parametrize(("camera", "sport", "seed"), [(2, "hockey", 8)])
+def test_another_recording_in_one_of_three_cameras_is_named(camera: int, sport: str, seed: int):
+    """The points give way to it: it makes noise, and few of its keypoints disagree."""
+    other = session(sport, cameras=3, frames=24, seed=seed).observations.keypoints
+    calibration = calibrate(with_camera(session(cameras=3, frames=24, seed=2).observations, camera, lambda _: other[camera]))
+    quality = calibration.quality
+    assert codes(quality)[0] == "camera_alien"
+    assert quality.findings[0].cameras == (f"cam{camera + 1:02d}",)
+
+
 def test_another_recording_in_one_camera_is_named():
     other = session("kendo", seed=7).observations.keypoints
     quality = calibrate(with_camera(session().observations, 4, lambda _: other[4])).quality
@@ -220,15 +230,58 @@ def test_another_recording_in_one_camera_is_named():
     )
 
 
-@pytest.mark.parametrize(("camera", "first"), [(0, 20), (3, 38)])
-@pytest.mark.parametrize(("turn_deg", "shift_m"), [(0.2, 0.0), (0.0, 0.01)])
-def test_a_small_step_is_found_where_it_is(camera: int, first: int, turn_deg: float, shift_m: float):
-    found = [
-        f for f in calibrate(knocked(session(), camera, first, turn_deg, shift_m)).quality.findings if f.code == "camera_moved"
-    ]
-    assert [f.cameras for f in found] == [(f"cam{camera + 1:02d}",)]
+@pytest.mark.parametrize(
+    ("camera", "first", "turn_deg", "shift_m"), [(0, 20, 0.1, 0.0), (3, 38, 0.2, 0.0), (0, 38, 0.0, 0.005), (3, 20, 0.0, 0.01)]
+)
+def test_a_small_step_is_found_where_it_is_and_as_large_as_it_is(camera: int, first: int, turn_deg: float, shift_m: float):
+    calibration = calibrate(knocked(session(), camera, first, turn_deg, shift_m))
+    motion = evidence_of(calibration).motion
+    found = [finding for finding in calibration.quality.findings if finding.code == "camera_moved"]
+    assert [finding.cameras for finding in found] == [(f"cam{camera + 1:02d}",)]
     assert found[0].frames is not None
     assert abs(found[0].frames[0] - first) <= 2
+    assert motion is not None
+    assert motion.like_turn
+    assert motion.frame_error <= 2
+    distance_m = 4.0
+    expected = turn_deg + torch.rad2deg(torch.tensor(shift_m / distance_m))
+    assert motion.rotation_deg == pytest.approx(float(expected), rel=0.3)
+
+
+@pytest.mark.parametrize("seed", [1, 5])
+def test_errors_that_last_are_no_motion_of_a_camera(seed: int):
+    """A detector that errs alike for some ten frames."""
+    given, keep = session(seed=seed), 0.9
+    generator = torch.Generator().manual_seed(seed)
+    keypoints = given.observations.keypoints.clone()
+    errors = torch.randn(5, 21, 2, generator=generator, dtype=torch.float64)
+    for frame in range(keypoints.shape[1]):
+        keypoints[:, frame] += 2.5 * errors
+        errors = keep * errors + (1 - keep**2) ** 0.5 * torch.randn(errors.shape, generator=generator, dtype=torch.float64)
+    calibration = calibrate(replace(given.observations, keypoints=keypoints))
+    evidence = evidence_of(calibration)
+    as_independent = evidence._motion_among(torch.ones_like(evidence.sigma_px))
+    assert as_independent is not None
+    assert as_independent.evidence > as_independent.least
+    assert evidence.motion is not None
+    assert evidence.motion.evidence < evidence.motion.least
+    assert "camera_moved" not in codes(calibration.quality)
+
+
+def test_a_camera_that_rolled_is_found():
+    """About its axis, which moves no image as a whole."""
+    given = session(frames=60)
+    centre = given.observations.cameras.matrix[2, :2, 2]
+    turn = torch.tensor(0.5).deg2rad().double()
+    turned = torch.stack([torch.stack([turn.cos(), -turn.sin()]), torch.stack([turn.sin(), turn.cos()])])
+    keypoints = given.observations.keypoints.clone()
+    keypoints[2, 30:] = (keypoints[2, 30:] - centre) @ turned.mT + centre
+    calibration = calibrate(replace(given.observations, keypoints=keypoints))
+    (found,) = [finding for finding in calibration.quality.findings if finding.code == "camera_moved"]
+    assert found.cameras == ("cam03",)
+    assert found.frames is not None
+    assert abs(found.frames[0] - 30) <= 2
+    assert "across" not in found.meaning
 
 
 def test_pulls_are_the_reduced_camera_system_frame_by_frame():

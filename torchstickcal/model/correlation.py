@@ -88,6 +88,14 @@ class ErrorCorrelation:
         lags = self.values[..., 1:3]
         return (1 - lags @ lags.new_tensor([4 / 3, -1 / 3])[: lags.shape[-1]]).clamp_min(_LEAST_JITTER)
 
+    @property
+    def varying_times(self) -> Tensor:
+        """The same, of errors whose mean over the session has been taken out, (B, P). A correlation that is left after half the
+        session is that of a part that is always the same."""
+        lags = self.values.shape[-1]
+        found = 1 - torch.arange(1, lags).to(self.values) / lags
+        return 1 + 2 * (self.values[..., 1:] - self.values[..., lags // 2, None]).clamp_min(0.0) @ found
+
     def spectrum(self, frames: int) -> Tensor:
         """Power of the errors at the frequencies of ``rfft`` over 2 ``frames`` frames, (B, P, frames + 1), mean 1."""
         lags = self.values[..., :frames]

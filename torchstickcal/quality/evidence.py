@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import torch
@@ -11,6 +11,7 @@ from torch import Tensor
 from torchstickcal.config import Config
 from torchstickcal.geometry import se3
 from torchstickcal.lazy import cached_property
+from torchstickcal.model.correlation import error_correlation
 from torchstickcal.model.measurements import Measurements
 from torchstickcal.model.state import State
 from torchstickcal.model.unknowns import all_unknowns
@@ -39,6 +40,8 @@ _SAID_BY_IMAGES = 2.0
 """Factor of the evidence against the clocks where the motion in the images, by itself, speaks against them too."""
 CONSTANT_SIGMAS = 0.5
 """Errors that are always the same, over the noise, from which on they matter."""
+_LARGEST_SIGMAS = 6.0
+"""Residual, in standard deviations, beyond which a point was lost."""
 _LEAST_FRAMES = 20
 """Least number of frames in which a camera sees a point, for the mean of its errors to be known."""
 _OTHER_PERSON_SHARE = 0.2
@@ -222,11 +225,20 @@ class Evidence:
         """(C, 2, P), mean residual of each point in each camera, pixels; 0 where it is seen in too few frames to tell."""
         m = self.kept
         sums = torch.zeros(self.cameras, 2, m.points_per_frame, dtype=torch.float64, device=m.pixels.device)
-        for columns, found, _ in m.residuals(self.state):
-            seen = m.visible[0][:, None, columns]
-            sums += found[0].double().where(seen, 0.0).unflatten(-1, (-1, m.points_per_frame)).sum(-2)
+        for _, errors, _ in self._errors_px:
+            sums += errors.sum(-2)
         count = m.by_frame(m.visible[0]).sum(1)[:, None]
         return (sums / count.clamp_min(1)).where(count >= _LEAST_FRAMES, 0.0)
+
+    @property
+    def _errors_px(self) -> Iterator[tuple[slice, Tensor, Tensor]]:
+        """Residuals (C, 2, f, P) of the keypoints that took part, 0 elsewhere, and which they are, (C, 1, f, P), by chunks of
+        columns. Large ones are those of a point that was lost, and are drawn in."""
+        m, largest = self.kept, _LARGEST_SIGMAS * self.sigma_px
+        for columns, residuals, _ in m.residuals(self.state):
+            seen = m.visible[0][:, None, columns].unflatten(-1, (-1, m.points_per_frame))
+            errors = residuals[0].double().unflatten(-1, seen.shape[-2:])
+            yield columns, errors.where(seen, 0.0).clamp(-largest, largest), seen
 
     @cached_property
     def constant_errors_sigmas(self) -> float:
@@ -239,10 +251,36 @@ class Evidence:
         """The most evident change of a camera's pose during the session; None where nothing can be said."""
         if self.cameras < 2 or not bool(self.kept.active.any()):
             return None
+        found = self._motion_among(torch.ones_like(self.sigma_px))
+        if found is None or found.evidence < found.least:
+            return found
+        times = self._varying_times
+        return self._motion_among(times) if bool((times > 1).any()) else found
+
+    def _motion_among(self, times: Tensor) -> Motion | None:
+        """The same, where of each point as many keypoints as ``times`` (P,) count as one."""
         m = self.measurements
-        varying = replace(m, pixels=m.pixels + self.constant_errors_px.to(m.pixels).repeat(1, 1, m.frames))
+        pixels = m.pixels + self.constant_errors_px.to(m.pixels).repeat(1, 1, m.frames)
+        varying = replace(m, pixels=pixels, confidence=(m.by_frame(m.confidence) / times.to(m.confidence)).flatten(-2))
         pulls = FramePulls.of(varying, self.state, self.ended.last.sigma_px)
         return motion_of(pulls, self.state.rotations[0], self.state.translations[0])
+
+    @cached_property
+    def _varying_times(self) -> Tensor:
+        """(P,), as many keypoints of a point are worth one: for how many frames their errors last, beside those that are always
+        the same, and those by which the image of a camera is shifted and turned, as if it had moved."""
+        m = self.kept
+        pixels = m.pixels.clone()
+        for columns, errors, seen in self._errors_px:
+            count = seen.sum(-1, keepdim=True).clamp_min(1)
+            places = m.pixels[0, :, :, columns].unflatten(-1, (-1, m.points_per_frame)).where(seen, 0.0)
+            x, y = (places - places.sum(-1, keepdim=True) / count).where(seen, 0.0).unbind(1)
+            turn = (x * errors[:, 1] - y * errors[:, 0]).sum(-1) / (x.square() + y.square()).sum(-1).clamp_min(1e-9)
+            turned = turn[:, None, :, None] * torch.stack([-y, x], dim=1)
+            shared = errors.sum(-1, keepdim=True) / count + turned
+            pixels[0, :, :, columns] += shared.flatten(-2).to(pixels)
+        alone = replace(m, pixels=pixels)
+        return error_correlation(alone, self.state, self.ended.last.sigma_px).varying_times[0]
 
     @cached_property
     def contradictions(self) -> dict[str, Tensor]:

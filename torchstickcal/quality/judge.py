@@ -15,6 +15,9 @@ from torchstickcal.workers import on_worker
 _NOISY_MRAD = 5.0
 """Noise of the keypoints above which causes are tried even where another was found: good detectors have 1 to 4. So they are
 where several things are wrong, which may have one cause."""
+_NOISY_OF_THREE_MRAD = 3.5
+"""The same with three cameras: there the points give way to a camera that shows something else. It makes noise, and few of its
+keypoints disagree."""
 
 
 def judged(evidence: Evidence) -> Quality:
@@ -40,6 +43,7 @@ def _worth_trying(evidence: Evidence, found: dict[Family, list[Finding]]) -> boo
         return True
     every = [finding for own in found.values() for finding in own]
     wrong = any(finding.severity >= Severity.SERIOUS or finding.code == "camera_doubtful" for finding in every)
+    wrong |= evidence.cameras == 3 and evidence.noise_mrad > _NOISY_OF_THREE_MRAD
     explaining = [family for family, own in found.items() if any(finding.is_cause for finding in own)]
     serious = [family for family, own in found.items() if any(finding.severity >= Severity.SERIOUS for finding in own)]
     alone = len(serious) < 2 and evidence.noise_mrad < _NOISY_MRAD

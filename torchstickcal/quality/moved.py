@@ -4,6 +4,9 @@ A camera that is turned or shifted at some frame pulls its keypoints one way bef
 and each frame, the change of pose from this frame on that the keypoints ask for is compared with its own standard deviation
 (score test). The points, and the poses of all cameras, may follow. Errors that are alike from frame to frame make such pulls
 by themselves: the variance is estimated from blocks of frames, not taken from the noise of single keypoints.
+
+A knock moves the whole image: it is found as a turn of the camera about its centre, also where the camera was shifted. The
+other three numbers of a change add more noise than evidence. They count only where they are strong.
 """
 
 from __future__ import annotations
@@ -17,9 +20,10 @@ from torchstickcal.geometry import se3
 from torchstickcal.geometry.singular import covariance_of
 from torchstickcal.quality.linear import FramePulls, variance_of_sums
 
-LEAST_EVIDENCE = 32.0
-"""Squared length of the change in its standard deviations, from which on a camera is said to have moved: 6 numbers are fitted
-at the best of many frames and cameras. Measured on sound sessions, see docs/quality.md."""
+LEAST_EVIDENCE, LEAST_EVIDENCE_OF_ANY = 24.0, 150.0
+"""Squared length of the change in its standard deviations, from which on a camera is said to have moved: of a turn, and of a
+change of any kind. Chance reaches the first in less than 1 % of sound sessions, where 3 numbers are fitted at the best of many
+frames and cameras. Measured on sound sessions, see docs/quality.md."""
 _PRIOR_M, _PRIOR_RAD = 0.03, 0.02
 """A change is expected to be smaller than this; it keeps the test finite where a direction is not determined."""
 _LEAST_FRAMES = 12
@@ -27,8 +31,13 @@ _EDGE = 0.04
 """Share of a session at each end in which no change is looked for: too few frames speak for it."""
 _BLOCKS = (12, 24, 48)
 """Numbers of blocks of frames from whose scatter the variance is estimated."""
-_LEAST_VARIANCE = 0.25
-"""Least variance of the pulls, over that of independent errors: of keypoints without noise only rounding errors are left."""
+_LEAST_VARIANCE = 0.6
+"""Least variance of the pulls, over that of independent errors. Robust noise makes it 0.7; of keypoints without noise only
+rounding errors are left."""
+_CERTAIN = 0.95
+_NOT_A_TURN = 11.3
+"""Evidence that a change has beyond a turn of the camera, from which on it was no turn: three more numbers have less by chance
+in 99 % of all sessions."""
 
 
 class Motion(NamedTuple):
@@ -37,10 +46,14 @@ class Motion(NamedTuple):
     camera: int
     frame: int
     """the first frame after it; for a drift the first of all"""
+    frame_error: int
+    """frames by which this may be wrong (95 %)"""
     evidence: float
     """squared length of the change in its standard deviations"""
+    least: float
+    """evidence from which on such a change is one"""
     rival: float
-    """the same for the best other camera"""
+    """the same as ``evidence`` for the best other camera"""
     rotation_deg: float
     shift_m: float
     """of the camera's centre"""
@@ -48,6 +61,8 @@ class Motion(NamedTuple):
     """(6,), of the pose afterwards: ``T Exp(tangent)``"""
     gradual: bool
     """whether it went on during the whole session, rather than at once"""
+    like_turn: bool
+    """whether a turn explains it as well, which is then the change; a shift across the axis looks like a turn across it"""
 
 
 def motion_of(pulls: FramePulls, rotations: Tensor, translations: Tensor) -> Motion | None:
@@ -60,73 +75,158 @@ def motion_of(pulls: FramePulls, rotations: Tensor, translations: Tensor) -> Mot
     """
     if pulls.parts < _LEAST_FRAMES:
         return None
-    gradient, information = pulls.gradient_by_part, pulls.information
-    cameras = gradient.shape[1]
-    prior = gradient.new_tensor([1 / _PRIOR_M**2] * 3 + [1 / _PRIOR_RAD**2] * 3).diag()
-    total = information.sum(0) + torch.block_diag(*[1e-2 * prior] * cameras)
-    inverse = covariance_of(total)
-    common = inverse @ gradient.sum(0).flatten()
-    gradient = gradient - (information @ common).unflatten(1, (cameras, 6))
-    edge = max(2, round(_EDGE * pulls.parts))
-    steps = torch.arange(edge, pulls.parts - edge + 1, device=gradient.device)
-    found = [_changes(c, gradient, information, inverse, prior, steps) for c in range(cameras)]
-    order = sorted(range(cameras), key=lambda c: -found[c].evidence)
-    best = found[order[0]]
-    rotation, translation = rotations[order[0]], translations[order[0]]
-    moved = se3.retract(rotation, translation, best.tangent)
-    shift = se3.camera_centres(*moved) - se3.camera_centres(rotation, translation)
+    system = _System.of(pulls)
+    poses = list(zip(rotations, translations, strict=True))
+    found = [_best_change(system, camera, _motions(*pose)) for camera, pose in enumerate(poses)]
+    order = sorted(range(len(found)), key=lambda camera: -found[camera].strength)
+    camera, best = order[0], found[order[0]]
+    like_turn = best.like_turn
+    tangent = best.asked.tangent(best.chosen, 3 if like_turn else 6)
+    before, after = poses[camera], se3.retract(*poses[camera], tangent)
     return Motion(
-        camera=order[0],
-        frame=pulls.first_frame(best.part),
-        evidence=best.evidence,
-        rival=found[order[1]].evidence if cameras > 1 else 0.0,
-        rotation_deg=float(best.tangent[3:].norm().rad2deg()),
-        shift_m=float(shift.norm()),
-        tangent=best.tangent,
+        camera=camera,
+        frame=0 if best.gradual else pulls.first_frame(best.part),
+        frame_error=round(best.part_error * len(pulls.part) / pulls.parts),
+        evidence=best.strength * best.least,
+        least=best.least,
+        rival=found[order[1]].strength * best.least if len(found) > 1 else 0.0,
+        rotation_deg=float(tangent[3:].norm().rad2deg()),
+        shift_m=float((se3.camera_centres(*after) - se3.camera_centres(*before)).norm()),
+        tangent=tangent,
         gradual=best.gradual,
+        like_turn=like_turn,
     )
 
 
+class _System(NamedTuple):
+    """What the keypoints of K parts of a session say about the poses of its cameras, around the best poses that stay."""
+
+    pull: Tensor
+    """(K, C, 6), half the gradient by the tangents"""
+    information: Tensor
+    """(K, 6 C, 6 C)"""
+    covariance: Tensor
+    """(6 C, 6 C), of the poses by all parts together"""
+
+    @staticmethod
+    def of(pulls: FramePulls) -> _System:
+        pull, information = pulls.gradient_by_part, pulls.information
+        cameras = pull.shape[1]
+        prior = pull.new_tensor([1 / _PRIOR_M**2] * 3 + [1 / _PRIOR_RAD**2] * 3).diag()
+        covariance = covariance_of(information.sum(0) + torch.block_diag(*[1e-2 * prior] * cameras))
+        common = covariance @ pull.sum(0).flatten()
+        return _System(pull - (information @ common).unflatten(1, (cameras, 6)), information, covariance)
+
+
+class _Asked(NamedTuple):
+    """Changes that n weighted sums of the pulls at one camera ask for: three turns about its centre, then three shifts."""
+
+    root: Tensor
+    """(n, 6, 6), Cholesky factor of the information about the change"""
+    pull: Tensor
+    """(n, 6), the pull in its standard deviations: of turns, and of what shifts have beyond turns"""
+    motions: Tensor
+    """(6, 6), tangents of the turns and shifts"""
+
+    @staticmethod
+    def by(pull: Tensor, own: Tensor, rows: Tensor, system: _System, motions: Tensor) -> _Asked:
+        """By sums of the pulls (n, 6), of the information about the camera (n, 6, 6), and about all of them (n, 6, 6 C)."""
+        prior = pull.new_tensor([1 / _PRIOR_RAD**2] * 3 + [1 / _PRIOR_M**2] * 3).diag()
+        left = motions.mT @ (own - rows @ system.covariance @ rows.mT) @ motions + prior
+        root = torch.linalg.cholesky_ex(left).L
+        pulled = torch.linalg.solve_triangular(root, (pull @ motions)[..., None], upper=False)[..., 0]
+        return _Asked(root, pulled.nan_to_num(), motions)
+
+    @property
+    def of_turn(self) -> Tensor:
+        """(n,), squared length of the turn in its standard deviations."""
+        return self.pull[:, :3].square().sum(-1)
+
+    @property
+    def of_any(self) -> Tensor:
+        """(n,), the same of the whole change."""
+        return self.pull.square().sum(-1)
+
+    @property
+    def strength(self) -> Tensor:
+        """(n,), evidence over the least that a change needs, without regard to lasting errors."""
+        return torch.maximum(self.of_turn / LEAST_EVIDENCE, self.of_any / LEAST_EVIDENCE_OF_ANY)
+
+    def tangent(self, index: int, size: int) -> Tensor:
+        """(6,), one of the changes: a turn for a size of 3, the whole change for 6."""
+        upper, pull = self.root[index, :size, :size].mT, self.pull[index, :size, None]
+        return -self.motions[:, :size] @ torch.linalg.solve_triangular(upper, pull, upper=True)[:, 0]
+
+
 class _Change(NamedTuple):
-    evidence: float
+    """The best change of one camera: of those asked for, one of them."""
+
+    asked: _Asked
+    chosen: int
+    turned: bool
+    """whether it is found as a turn, rather than as a change of any kind"""
+    variance: float
+    """of the pulls, over that of independent errors"""
     part: int
-    tangent: Tensor
     gradual: bool
 
+    @property
+    def least(self) -> float:
+        """The least evidence that it needs."""
+        return LEAST_EVIDENCE if self.turned else LEAST_EVIDENCE_OF_ANY
 
-def _changes(camera: int, gradient: Tensor, information: Tensor, inverse: Tensor, prior: Tensor, steps: Tensor) -> _Change:
+    @property
+    def strength(self) -> float:
+        """Evidence over the least that it needs."""
+        return float(self.asked.strength[self.chosen]) / self.variance
+
+    @property
+    def like_turn(self) -> bool:
+        """Whether a turn explains it as well."""
+        return float((self.asked.of_any - self.asked.of_turn)[self.chosen]) < _NOT_A_TURN * self.variance
+
+    @property
+    def part_error(self) -> int:
+        """Parts by which it may be at another one, by the likelihood of the others; 0 for a drift."""
+        evidence = self.asked.of_turn if self.turned else self.asked.of_any
+        likelihood = torch.softmax(evidence / (2 * self.variance), dim=0)
+        distances = (torch.arange(len(evidence), device=evidence.device) - self.chosen).abs()
+        within = torch.zeros_like(likelihood).index_add_(0, distances, likelihood)
+        return int((within.cumsum(0) < _CERTAIN).sum())
+
+
+def _motions(rotation: Tensor, translation: Tensor) -> Tensor:
+    """Tangents (6, 6) that turn a camera about its centre, around its own axes, and that shift it along them."""
+    axes = rotation.mT
+    centre = se3.camera_centres(rotation, translation)
+    turns = torch.cat([torch.linalg.cross(centre[:, None].expand_as(axes), axes, dim=0), axes])
+    return torch.cat([turns, torch.cat([axes, torch.zeros_like(axes)])], dim=1)
+
+
+def _best_change(system: _System, camera: int, motions: Tensor) -> _Change:
     """The best change of one camera: at once, before one of some parts, or gradually over the session."""
     place = slice(6 * camera, 6 * camera + 6)
-    pull, rows = gradient[:, camera], information[:, place]
-    parts = len(pull)
-    after, rows_after = _from(pull)[steps], _from(rows)[steps]
-    changes, evidence = _scored(after, rows_after[..., place], rows_after, inverse, prior)
-    best = int(evidence.argmax())
-    step = torch.arange(parts, device=pull.device) >= steps[best]
-    variance = variance_of_sums(pull - _explained(rows[..., place], step.to(pull), changes[best]), rows[..., place], _BLOCKS)
+    pull, rows = system.pull[:, camera], system.information[:, place]
+    own, parts = rows[..., place], len(pull)
+    edge = max(2, round(_EDGE * parts))
+    steps = torch.arange(edge, parts - edge + 1, device=pull.device)
+    rows_after = _from(rows)[steps]
+    at_once = _Asked.by(_from(pull)[steps], rows_after[..., place], rows_after, system, motions)
     ramp = torch.linspace(-0.5, 0.5, parts).to(pull)
-    drawn = (ramp[:, None] * pull).sum(0), (ramp[:, None, None] * rows).sum(0)
-    squared = (ramp.square()[:, None, None] * rows[..., place]).sum(0)
-    drift, drift_evidence = _scored(drawn[0][None], squared[None], drawn[1][None], inverse, prior)
-    gradual = float(drift_evidence) > float(evidence[best])
-    if gradual:
-        variance = variance_of_sums(pull - _explained(rows[..., place], ramp, drift[0]), rows[..., place], _BLOCKS)
-    strongest = max(float(drift_evidence), float(evidence[best]))
-    tangent, part = (drift[0], 0) if gradual else (changes[best], int(steps[best]))
-    return _Change(strongest / max(variance, _LEAST_VARIANCE), part, tangent, gradual)
-
-
-def _scored(pull: Tensor, own: Tensor, rows: Tensor, inverse: Tensor, prior: Tensor) -> tuple[Tensor, Tensor]:
-    """Changes (n, 6) that pulls (n, 6) ask for, and their squared lengths in standard deviations, (n,)."""
-    left = own - rows @ inverse @ rows.mT + prior
-    change = torch.linalg.solve(left, pull[..., None])[..., 0]
-    return -change, (pull * change).sum(-1)
-
-
-def _explained(own: Tensor, share: Tensor, change: Tensor) -> Tensor:
-    """Pulls (K, 6) that a change explains, of which each part has a share (K,), up to a constant."""
-    share = share - share.mean()
-    return -share[:, None] * (own @ change)
+    rows_along = (ramp @ rows.flatten(1)).view(1, 6, -1)
+    squared = (ramp.square() @ own.flatten(1)).view(1, 6, 6)
+    along = _Asked.by((ramp @ pull)[None], squared, rows_along, system, motions)
+    strength = at_once.strength
+    best = int(strength.argmax())
+    gradual = float(along.strength[0]) > float(strength[best])
+    asked, index = (along, 0) if gradual else (at_once, best)
+    share = ramp if gradual else (torch.arange(parts, device=pull.device) >= steps[best]).to(pull)
+    turned = float(asked.of_turn[index]) / LEAST_EVIDENCE > float(asked.of_any[index]) / LEAST_EVIDENCE_OF_ANY
+    change = asked.tangent(index, 3 if turned else 6)
+    others = system.covariance @ ((rows_along[0] if gradual else rows_after[best]).mT @ change)
+    explained = rows @ others - share[:, None] * (own @ change)
+    variance = max(variance_of_sums(pull - explained, own, _BLOCKS), _LEAST_VARIANCE)
+    return _Change(asked, index, turned, variance, int(steps[best]), gradual)
 
 
 def _from(values: Tensor) -> Tensor:

@@ -17,7 +17,8 @@ _TALL_M, _SHORT_M = 2.10, 1.35
 _TALLEST_M, _SHORTEST_M = 2.4, 1.1
 """Standing heights, by the segments, that are unusual, and those that no athlete has. Heights from a detector's joints are
 wrong by up to 8 %."""
-_LEAST_FRAMES = 15
+_LEAST_FRAMES, _LEAST_LENGTHS = 15, 8
+"""Frames in which a limb counts by itself, and lengths of all limbs together that count where no limb does."""
 _MIRRORED_SHARE = 0.8
 
 
@@ -39,16 +40,17 @@ def height_m(points: Tensor, places: dict[str, int]) -> float | None:
         points: (3, F, P), metres, NaN where not known.
         places: index of each named point.
     """
-    found: list[float] = []
+    found: list[Tensor] = []
     for (start, end), share in _SEGMENTS.items():
         for side in ("left", "right"):
             pair = [places.get(f"{side}_{joint}") for joint in (start, end)]
             if None not in pair:
                 lengths = (points[..., pair[1]] - points[..., pair[0]]).norm(dim=0)
-                lengths = lengths[lengths.isfinite()]
-                if len(lengths) >= _LEAST_FRAMES:
-                    found.append(float(lengths.median()) / share)
-    return float(torch.tensor(found).median()) if found else None
+                found.append(lengths[lengths.isfinite()] / share)
+    if known := [heights.median() for heights in found if len(heights) >= _LEAST_FRAMES]:
+        return float(torch.stack(known).median())
+    together = torch.cat(found) if found else points.new_zeros(0)
+    return float(together.median()) if len(together) >= _LEAST_LENGTHS else None
 
 
 def _height(evidence: Evidence, places: dict[str, int]) -> Iterator[Finding]:

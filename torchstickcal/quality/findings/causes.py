@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from dataclasses import replace
 
@@ -38,6 +39,8 @@ _IN_TIME_SHARE = 0.85
 _FARTHEST_DEG, _FARTHEST_SHARE = 45.0, 0.3
 """Largest change of a camera that is a motion of it, the shift as a share of the rig; beyond, it shows something else."""
 _MOST_SUSPECTS = 4
+_SHARE_OF_NOISE = 0.1
+"""Share of agreeing keypoints that is worth as much as noise smaller by the factor e."""
 _BEHIND_OTHERS = 0.75
 _SUSPECT_SHARE = 0.8
 _NOISE_RATIO, _NOISY_MRAD = 0.6, 2.0
@@ -57,7 +60,8 @@ def causes(evidence: Evidence) -> Iterator[Finding]:
     order = agreement.argsort().tolist()
     suspicious = (evidence.absurd_focals | evidence.off_centre).tolist()
     off_centre = [camera for camera in order if evidence.off_centre[camera]]
-    suspects = off_centre or [c for c in order if float(agreement[c]) < _SUSPECT_SHARE or suspicious[c]] or order
+    doubted = [c for c in order if float(agreement[c]) < _SUSPECT_SHARE or suspicious[c]]
+    suspects = off_centre or (doubted if evidence.cameras > 3 else []) or order
     best: tuple[float, int, Rest] | None = None
     for camera in suspects[:_MOST_SUSPECTS]:
         rest = without(evidence, camera)
@@ -75,7 +79,8 @@ def causes(evidence: Evidence) -> Iterator[Finding]:
 
 
 def _soundness(rest: Rest) -> float:
-    return rest.share - 0.02 * rest.noise_mrad
+    """How well the cameras of a rig agree. Points of two cameras give way to errors, so that noise counts as much as shares."""
+    return rest.share - _SHARE_OF_NOISE * math.log(max(rest.noise_mrad, 1e-3))
 
 
 def _explained(evidence: Evidence, camera: int, rest: Rest, agreement: float) -> Finding | None:
