@@ -154,7 +154,9 @@ def test_block_tridiagonal(count: int):
     dense = (factor @ factor.mT).reshape(2, count, 4, count, 4)
     levels = (count - 1).bit_length()
     missing = -2 * count % 2**levels  # two chains one after another, with zeros between them, filled up with identities
-    diagonal = torch.cat([dense.diagonal(dim1=1, dim2=3).movedim(-1, 1).flatten(0, 1), torch.eye(4).double().expand(missing, 4, 4)])
+    diagonal = torch.cat(
+        [dense.diagonal(dim1=1, dim2=3).movedim(-1, 1).flatten(0, 1), torch.eye(4).double().expand(missing, 4, 4)]
+    )
     under = torch.zeros(2, count, 4, 4, dtype=torch.float64)
     under[:, :-1] = dense.diagonal(-1, dim1=1, dim2=3).movedim(-1, 1)
     under = torch.cat([under.flatten(0, 1), torch.zeros(missing, 4, 4, dtype=torch.float64)])
