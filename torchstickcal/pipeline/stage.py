@@ -127,7 +127,9 @@ def run_stage(
         objective,
         state,
         cameras_free=stage.cameras == "free",
-        termination=Termination(stage.max_iterations, max(stage.cost_tolerance, least)),
+        termination=Termination(
+            stage.max_iterations, max(stage.cost_tolerance, least), newton_follows=run.to_rounding and least > 0
+        ),
         stage=name,
         listener=run.listener,
     )

@@ -22,6 +22,8 @@ _ROUNDING_SIGMAS, _NEAR_SIGMAS = 1e-7, 1e-3
 near enough for everything but gradients, and as near as float32 allows."""
 _FAR_SIGMAS, _FAR_FROM_NEAR_SIGMAS = 1e-4, 1e-2
 """The same, above which steps that do not become shorter any more say that there is no minimum: rounding errors are smaller."""
+_REMAINING = 0.1
+"""What a step leaves, as a share of that length, below which it is the last as well: as much shorter as it was made shorter."""
 _SLOW, _OLD = 0.3, 3
 """Ratio of the lengths of two steps, and number of steps with one Hessian, from which on it is built anew."""
 
@@ -68,8 +70,9 @@ def minimum_near(
         slow = bool((moving & ~(length < _SLOW * shortest)).any())
         if not back:
             best = trial if bool((shorter | ~moving).all()) else best.replaced(moving & shorter, trial)
+            last = shorter & shortest.isfinite() & (length.square() <= _REMAINING * tolerance * shortest)
             shortest = torch.where(moving & shorter, length, shortest)
-            ended = moving & (shortest <= tolerance)
+            ended = moving & (last | (shortest <= tolerance))
             best = best.replaced(ended, _moved(best, step, -1.0)) if bool(ended.any()) else best
             moving &= ~ended & (shorter if age_of_step == 0 else True)
         if not bool(moving.any()):
