@@ -15,6 +15,7 @@ from torch import Tensor
 
 from torchstickcal.config import Config, Stage
 from torchstickcal.model.measurements import Measurements
+from torchstickcal.model.ranks import nanquantile
 from torchstickcal.model.state import State
 from torchstickcal.model.unknowns import RigUnknowns, clock_refinements, with_refinements
 from torchstickcal.observations import Observations
@@ -507,7 +508,7 @@ def _small_squared_residuals(adjustment: Adjustment) -> Tensor:
     m = adjustment.measurements
     squared = m.squared_residuals(adjustment.state).double().where(m.visible, torch.nan).flatten(1)
     step = -(-squared.shape[1] // _MOST_SORTED)
-    return squared[:, ::step].nanquantile(0.25, dim=1)
+    return nanquantile(squared[:, ::step], 0.25)
 
 
 def relabelled(adjustment: Adjustment, run: Run) -> Adjustment:
