@@ -50,10 +50,13 @@ def near_keypoints(measurements: Measurements, squared_residuals: Tensor) -> Ten
     variance, views = _initial_variance(squared, visible), visible.sum(1)
     near = visible
     for iteration in range(_ITERATIONS):
+        before = near
         if iteration:
             variance = _variance(squared, near, measurements.num_cameras, NEAR_SIGMAS)
         near = visible & (squared <= (NEAR_SIGMAS**2 * variance[:, None] * _remaining_share(views))[:, None])
         near = near & (near.sum(1, keepdim=True) >= 2)
+        if iteration and torch.equal(near, before):  # and so it would stay
+            break
         views = near.sum(1)
     mask = torch.zeros_like(measurements.by_frame(measurements.visible))
     mask[:, :, _frames_looked_at(measurements)] = near

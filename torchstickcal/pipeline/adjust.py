@@ -46,9 +46,8 @@ says that one of them is wrong."""
 _EXACT = 1e-5
 """Cost tolerance of the stage for this comparison."""
 _MOST_SORTED = 100_003
-_ROUGHLY, _NEARLY = 1e-3, 1e-6
-"""Relative decrease of the cost from which on Newton's method can take over; and from which on what it still changes is
-negligible."""
+_ROUGHLY = 1e-3
+"""Relative decrease of the cost from which on Newton's method can take over."""
 _SETTLED = 0.1
 """Relative change of the numbers of keypoints that count as one, below which a stage need not be repeated with new ones."""
 
@@ -405,7 +404,7 @@ def _with_last_camera_stage(adjustment: Adjustment, run: Run) -> Adjustment:
     *_, last = run.camera_stages.items()
     least = 0.0
     if run.settles and not adjustment.asynchronous:
-        least = _ROUGHLY if run.to_rounding else _NEARLY
+        least = _ROUGHLY
     return _settled(_synchronised(through([last], adjustment, run, least), run), run)
 
 

@@ -17,8 +17,8 @@ from torchstickcal.solvers.acceleration import Acceleration
 from torchstickcal.solvers.linearised import Linearised, Tangent, gradient_at
 
 _MAX_ROUNDS = 40
-_ROUNDING_SIGMAS, _NEAR_SIGMAS = 1e-7, 1e-3
-"""Length of a step, in standard deviations of the estimate, below which it is the last: for a minimum up to rounding errors, or
+_ROUNDING_SIGMAS, _NEAR_SIGMAS, _FLOAT32_SIGMAS = 1e-7, 1e-4, 1e-3
+"""Length of a step, in standard deviations of the estimate, below which it is the last: for a minimum up to rounding errors,
 near enough for everything but gradients, and as near as float32 allows."""
 _FAR_SIGMAS, _FAR_FROM_NEAR_SIGMAS = 1e-4, 1e-2
 """The same, above which steps that do not become shorter any more say that there is no minimum: rounding errors are smaller."""
@@ -59,8 +59,8 @@ def minimum_near(
     at, acceleration = Linearised(objective_at(trial), trial, cameras_free), Acceleration()
     objective, gradient, age, age_of_step, back = at.objective, at.gradient, 0, 0, False
     is_double = objective.measurements.pixels.dtype == torch.float64
-    exact = to_rounding and is_double
-    tolerance, far = (_ROUNDING_SIGMAS, _FAR_SIGMAS) if exact else (_NEAR_SIGMAS, _FAR_FROM_NEAR_SIGMAS)
+    tolerance = _FLOAT32_SIGMAS if not is_double else _ROUNDING_SIGMAS if to_rounding else _NEAR_SIGMAS
+    far = _FAR_SIGMAS if tolerance == _ROUNDING_SIGMAS else _FAR_FROM_NEAR_SIGMAS
     shortest = torch.full_like(state.points[:, 0, 0], torch.inf)
     moving = torch.ones_like(shortest, dtype=torch.bool)
     for _ in range(_MAX_ROUNDS):

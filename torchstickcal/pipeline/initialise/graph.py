@@ -147,10 +147,9 @@ def propagate(edges: Sequence[Edge], views: Views, scale: float) -> tuple[Array,
 def _doubtful(rotations: Array, translations: Array, rays: Array, visible: NDArray[np.bool_], scale: float) -> list[int]:
     """The cameras that the points of all others contradict, the least supported first; none of two."""
     shares: dict[int, float] = {}
-    for camera in range(len(rays)) if len(rays) > 2 else ():
-        # points that most views agree on take longer, and are needed only where plain ones do not do
-        plain = _supported(camera, rotations, translations, rays, visible, scale, triangulate).share
-        if plain < _SOUND_SHARE:
+    # points that most views agree on take longer, and are needed only where plain ones do not do
+    for camera, plain in enumerate(_points_by_others(rotations, translations, rays, visible, scale) if len(rays) > 2 else ()):
+        if _support(camera, plain, rotations, translations, rays, visible, scale).share < _SOUND_SHARE:
             shares[camera] = _supported(camera, rotations, translations, rays, visible, scale).share
     return [camera for camera in sorted(shares, key=lambda c: shares[c]) if shares[camera] < _SOUND_SHARE]
 
@@ -215,20 +214,39 @@ class _Support(NamedTuple):
 
 
 def _supported(
+    camera: int, rotations: Array, translations: Array, rays: Array, visible: NDArray[np.bool_], scale: float
+) -> _Support:
+    """The support of a camera by the points that most of the others agree on."""
+    others = [other for other in range(len(rays)) if other != camera]
+    known = _points(triangulate_robustly, others, rotations, translations, rays, visible, scale)
+    return _support(camera, known, rotations, translations, rays, visible, scale)
+
+
+def _support(
     camera: int,
+    known: Array,
     rotations: Array,
     translations: Array,
     rays: Array,
     visible: NDArray[np.bool_],
     scale: float,
-    method: Callable[..., torch.Tensor] = triangulate_robustly,
 ) -> _Support:
-    """The support of a camera by the points of all others, triangulated by a method."""
-    others = [other for other in range(len(rays)) if other != camera]
-    known = _points(method, others, rotations, translations, rays, visible, scale)
+    """The support of a camera by points (3, n) of all others."""
     seen = np.flatnonzero(visible[camera] & np.isfinite(known).all(0))
     weights = _kernel_weights(rotations[camera], translations[camera], known[:, seen], rays[camera][:, seen], scale)
     return _Support(float(weights.mean()) if len(seen) else 1.0, known, seen)
+
+
+def _points_by_others(
+    rotations: Array, translations: Array, rays: Array, visible: NDArray[np.bool_], scale: float
+) -> Iterable[Array]:
+    """For each camera, the points (3, n) that the others see; NaN where fewer than two of them do. All are triangulated at
+    once."""
+    cameras, columns = visible.shape
+    others = visible[:, None] & ~np.eye(cameras, dtype=bool)[..., None]
+    every, repeated = list(range(cameras)), np.tile(rays, (1, 1, cameras))
+    known = _points(triangulate, every, rotations, translations, repeated, others.reshape(cameras, -1), scale)
+    return np.moveaxis(known.reshape(3, cameras, columns), 1, 0)
 
 
 def _points(
