@@ -237,28 +237,25 @@ def _support(
     return _Support(float(weights.mean()) if len(seen) else 1.0, known, seen)
 
 
-def _points_by_others(
-    rotations: Array, translations: Array, rays: Array, visible: NDArray[np.bool_], scale: float
-) -> Iterable[Array]:
-    """For each camera, the points (3, n) that the others see; NaN where fewer than two of them do. All are triangulated at
-    once."""
-    cameras, columns = visible.shape
-    others = visible[:, None] & ~np.eye(cameras, dtype=bool)[..., None]
-    every, repeated = list(range(cameras)), np.tile(rays, (1, 1, cameras))
-    known = _points(triangulate, every, rotations, translations, repeated, others.reshape(cameras, -1), scale)
-    return np.moveaxis(known.reshape(3, cameras, columns), 1, 0)
+def _points_by_others(rotations: Array, translations: Array, rays: Array, visible: NDArray[np.bool_], scale: float) -> Array:
+    """For each of the cameras, the points that the others see, (C, 3, n); NaN where fewer than two of them do."""
+    others = np.array([[other for other in range(len(rays)) if other != camera] for camera in range(len(rays))])
+    return _points(triangulate, others, rotations, translations, rays, visible, scale)
 
 
 def _points(
     method: Callable[..., torch.Tensor],
-    cameras: list[int],
+    cameras: list[int] | NDArray[np.int_],
     rotations: Array,
     translations: Array,
     rays: Array,
     visible: NDArray[np.bool_],
     scale: float,
 ) -> Array:
-    """Points (3, n) that some of the cameras see, triangulated by a method; NaN where fewer than two of them do."""
+    """Points (3, n) that some of the cameras see, triangulated by a method; NaN where fewer than two of them do.
+
+    Several rows of cameras, of the same number, give several such sets of points, (..., 3, n).
+    """
     known = (torch.from_numpy(of_cameras[cameras]) for of_cameras in (rotations, translations, rays))
     return method(*known, torch.from_numpy(visible[cameras]).double(), scale=scale).numpy()
 
