@@ -41,7 +41,7 @@ class Termination:
             cameras. This criterion stops a run in which only poorly determined points still move, such as points with
             outliers.
         newton_follows: whether Newton's method goes on from where the solver stops. It then stops as soon as the next step
-            promises to decrease the cost by less than the tolerance, without trying it.
+            promises to decrease the cost by less than the tolerance, without trying it, unless only one step is allowed.
     """
 
     max_iterations: int = 100

@@ -102,9 +102,10 @@ class _SessionControl:
     def __init__(self, termination: Termination, exact_cost: float) -> None:
         self._termination, self._exact_cost = termination, exact_cost
         self._cost, self._predicted, self._damped_share, self._camera_sigmas = math.inf, 0.0, 0.0, math.inf
-        self._shrinkage = 0.0 if termination.newton_follows else 1.0
+        hands_over = termination.newton_follows and termination.max_iterations > 1
+        self._shrinkage = 0.0 if hands_over else 1.0
         """predicted decrease of the cost over that of the step before; for the first step, what is assumed"""
-        self._negligible_share = 1.0 if termination.newton_follows else _NEGLIGIBLE_SHARE
+        self._negligible_share = 1.0 if hands_over else _NEGLIGIBLE_SHARE
         self._trial_damping, self._factor, self._rejected = _INITIAL_DAMPING, _DECREASE, False
         self.damping = _INITIAL_DAMPING
         self.iteration = -1
