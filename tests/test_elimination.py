@@ -140,6 +140,27 @@ def test_inverse_diagonal():
     torch.testing.assert_close(inverse_diagonal(blocks).mT, torch.linalg.inv(matrices).diagonal(dim1=1, dim2=2))
 
 
+def test_what_is_not_finite_in_one_session_leaves_the_others_alone():
+    diagonal = torch.eye(3, dtype=torch.float64).repeat(12, 1, 1)
+    below = torch.full_like(diagonal, 0.1)
+    below[3::4] = 0.0
+    right = torch.ones(12, 3, 1, dtype=torch.float64)
+
+    def solved(diagonal: torch.Tensor, right: torch.Tensor) -> torch.Tensor:
+        solver = BlockTridiagonal(diagonal, below, levels=2, sessions=3)
+        return solver.backward_solve(solver.forward_solve(right))
+
+    expected = solved(diagonal, right)
+    for bad in (4, 5, 6, 7):
+        not_definite, not_finite = diagonal.clone(), right.clone()
+        not_definite[bad] *= -1
+        not_finite[bad] = torch.nan
+        for found in (solved(not_definite, right), solved(diagonal, not_finite)):
+            assert found[4:8].isnan().any()
+            for others in (slice(0, 4), slice(8, 12)):
+                torch.testing.assert_close(found[others], expected[others], rtol=0, atol=0)
+
+
 @pytest.mark.parametrize("count", [1, 2, 3, 6, 9])
 def test_block_tridiagonal(count: int):
     torch.manual_seed(count)

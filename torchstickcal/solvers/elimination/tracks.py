@@ -40,20 +40,23 @@ class _Level(NamedTuple):
     left: Tensor
     """L^-1 times the block between an odd block and the even block before it"""
     right: Tensor
-    """L^-1 times the block between an odd block and the even block after it; the last one has none"""
+    """L^-1 times the block between an odd block and the even block after it; the last one of a session has none"""
 
 
 class BlockTridiagonal:
     """Cholesky factor L of a symmetric, positive definite, block tridiagonal matrix. Blocks are in the order of elimination.
 
     Args:
-        diagonal: the N diagonal blocks, (N, m, m); N is a multiple of ``2 ** levels``.
-        below: the blocks below the diagonal, block (i + 1, i) at index i, (N, m, m); the last one is zero.
+        diagonal: the N diagonal blocks of all sessions, (N, m, m).
+        below: the blocks below the diagonal, block (i + 1, i) at index i, (N, m, m); the last one of a session is zero.
         levels: number of reductions after which no coupling is left: of chains of n coupled blocks, the logarithm of n to the
             base of 2, rounded up.
+        sessions: how many there are, of ``N / sessions`` blocks each, a multiple of ``2 ** levels``. What is not finite in one
+            of them leaves the others alone.
     """
 
-    def __init__(self, diagonal: Tensor, below: Tensor, levels: int) -> None:
+    def __init__(self, diagonal: Tensor, below: Tensor, levels: int, sessions: int = 1) -> None:
+        self._sessions = sessions
         size, self._levels = diagonal.shape[-1], list[_Level]()
         identity = torch.eye(size, dtype=diagonal.dtype, device=diagonal.device)
         failures: list[Tensor] = []
@@ -69,9 +72,9 @@ class BlockTridiagonal:
             left, right = sides.split(size, dim=-1)
             to_right, of_right = torch.bmm(right.mT, sides).split(size, dim=-1)
             diagonal = torch.baddbmm(diagonal[0::2], left.mT, left, alpha=-1)
-            diagonal[1:] -= of_right[:-1]
+            self._by_session(diagonal)[:, 1:] -= self._by_session(of_right)[:, :-1]
             below = -to_right
-            self._levels.append(_Level(inverse, left, right[:-1]))
+            self._levels.append(_Level(inverse, left, right))
         self._last = inverse_factor(diagonal)
         if bool(torch.cat(failures).any()):
             inverses = [*(level.inverse for level in self._levels), self._last]
@@ -88,7 +91,7 @@ class BlockTridiagonal:
         for level in self._levels:
             odd = torch.bmm(level.inverse, rhs[1::2])
             rhs = torch.baddbmm(rhs[0::2], level.left.mT, odd, alpha=-1)
-            rhs[1:].baddbmm_(level.right.mT, odd[:-1], alpha=-1)
+            self._by_session(rhs)[:, 1:] -= self._by_session(torch.bmm(level.right.mT, odd))[:, :-1]
             solved.append(odd)
         return [*solved, torch.bmm(self._last, rhs)]
 
@@ -97,9 +100,12 @@ class BlockTridiagonal:
         x = torch.bmm(self._last.mT, solved[-1])
         for level, y in zip(reversed(self._levels), reversed(solved[:-1]), strict=True):
             odd = torch.baddbmm(y, level.left, x, alpha=-1)
-            odd[:-1].baddbmm_(level.right, x[1:], alpha=-1)
+            self._by_session(odd)[:, :-1] -= self._by_session(torch.bmm(level.right, x.roll(-1, 0)))[:, :-1]
             x = torch.stack([x, torch.bmm(level.inverse.mT, odd)], dim=1).flatten(0, 1)
         return x
+
+    def _by_session(self, blocks: Tensor) -> Tensor:
+        return blocks.unflatten(0, (self._sessions, -1))
 
 
 class Tracks(NamedTuple):
@@ -181,7 +187,7 @@ class TrackElimination:
         diagonal.diagonal(dim1=2, dim2=3)[:, self._used :] = 1.0
         for layout, tracks, *own in zip(self._layouts, groups, self._of_each(diagonal), self._of_each(below), strict=True):
             layout.write(tracks, *own)
-        self._factor = BlockTridiagonal(diagonal.flatten(0, 1), below.flatten(0, 1), levels)
+        self._factor = BlockTridiagonal(diagonal.flatten(0, 1), below.flatten(0, 1), levels, self._sessions)
 
     def forward_solve(self, rhs: Tensor) -> Tensor:
         """``L^-1 b`` for right-hand sides b, (B, 3, n): (B, 3 n'), in the order of elimination, with n' >= n."""
