@@ -140,6 +140,27 @@ def test_inverse_diagonal():
     torch.testing.assert_close(inverse_diagonal(blocks).mT, torch.linalg.inv(matrices).diagonal(dim1=1, dim2=2))
 
 
+def test_what_is_not_finite_in_one_session_leaves_the_others_alone():
+    diagonal = torch.eye(3, dtype=torch.float64).repeat(12, 1, 1)
+    below = torch.full_like(diagonal, 0.1)
+    below[3::4] = 0.0
+    right = torch.ones(12, 3, 1, dtype=torch.float64)
+
+    def solved(diagonal: torch.Tensor, right: torch.Tensor) -> torch.Tensor:
+        solver = BlockTridiagonal(diagonal, below, levels=2, sessions=3)
+        return solver.backward_solve(solver.forward_solve(right))
+
+    expected = solved(diagonal, right)
+    for bad in (4, 5, 6, 7):
+        not_definite, not_finite = diagonal.clone(), right.clone()
+        not_definite[bad] *= -1
+        not_finite[bad] = torch.nan
+        for found in (solved(not_definite, right), solved(diagonal, not_finite)):
+            assert found[4:8].isnan().any()
+            for others in (slice(0, 4), slice(8, 12)):
+                torch.testing.assert_close(found[others], expected[others], rtol=0, atol=0)
+
+
 @pytest.mark.parametrize("count", [1, 2, 3, 6, 9])
 def test_block_tridiagonal(count: int):
     torch.manual_seed(count)
@@ -152,9 +173,17 @@ def test_block_tridiagonal(count: int):
             factor[:, g, :, g - 1] = below[:, g - 1]
     factor = factor.reshape(2, 4 * count, 4 * count)
     dense = (factor @ factor.mT).reshape(2, count, 4, count, 4)
-    diagonal = torch.stack([dense[:, g, :, g] for g in range(count)], dim=1)
-    under = [dense[:, g + 1, :, g] for g in range(count - 1)]
-    solver = BlockTridiagonal(diagonal, torch.stack(under, dim=1) if under else diagonal.new_zeros(2, 0, 4, 4))
-    right = torch.randn(2, count, 4, 3, dtype=torch.float64)
-    expected = torch.linalg.solve(factor @ factor.mT, right.reshape(2, -1, 3)).reshape(right.shape)
-    torch.testing.assert_close(solver.backward_solve(solver.forward_solve(right)), expected, rtol=1e-9, atol=1e-10)
+    levels = (count - 1).bit_length()
+    missing = -2 * count % 2**levels  # two chains one after another, with zeros between them, filled up with identities
+    diagonal = torch.cat(
+        [dense.diagonal(dim1=1, dim2=3).movedim(-1, 1).flatten(0, 1), torch.eye(4).double().expand(missing, 4, 4)]
+    )
+    under = torch.zeros(2, count, 4, 4, dtype=torch.float64)
+    under[:, :-1] = dense.diagonal(-1, dim1=1, dim2=3).movedim(-1, 1)
+    under = torch.cat([under.flatten(0, 1), torch.zeros(missing, 4, 4, dtype=torch.float64)])
+    solver = BlockTridiagonal(diagonal, under, levels)
+    right = torch.randn(2 * count + missing, 4, 3, dtype=torch.float64)
+    solved = solver.forward_solve(right)
+    assert [len(level) for level in solved] == solver.counts(2 * count + missing)
+    expected = torch.linalg.solve(factor @ factor.mT, right[: 2 * count].reshape(2, -1, 3)).reshape(-1, 4, 3)
+    torch.testing.assert_close(solver.backward_solve(solved)[: 2 * count], expected, rtol=1e-9, atol=1e-10)

@@ -12,7 +12,8 @@ import torch
 
 from torchstickcal import Observations, RigError, calibrate, errors, metrics
 from torchstickcal.config import InitialiseSettings, load_config
-from torchstickcal.geometry.triangulation import triangulate
+from torchstickcal.geometry import triangulation
+from torchstickcal.geometry.triangulation import triangulate, triangulate_robustly
 from torchstickcal.model.measurements import Measurements
 from torchstickcal.model.state import State
 from torchstickcal.pipeline.adjust import adjust_cameras, begin
@@ -137,6 +138,33 @@ def test_triangulation_is_exact_and_robust():
     assert (found - expected)[:, 7].norm() < 0.01
     weights[1:, 3] = 0
     assert triangulate(truth.rotations, truth.translations, rays, weights, scale=0.01)[:, 3].isnan().all()
+
+
+def test_points_of_several_sets_of_cameras_are_triangulated_at_once_as_one_by_one():
+    observations, truth = golf_session(cameras=5, frames=4, noise=Noise(2.0, missing=0.2, outliers=0.1))
+    measurements = Measurements.of(observations)
+    rays = measurements.cameras[0].undistort(measurements.pixels[0].movedim(1, -1)).movedim(-1, 1)
+    every = (truth.rotations, truth.translations, rays.nan_to_num(), measurements.confidence[0])
+    sets = torch.tensor([[0, 1, 2], [4, 1, 3], [2, 3, 4]])
+    found = triangulate(*(given[sets] for given in every), scale=0.01)
+    for points, cameras in zip(found, sets, strict=True):
+        torch.testing.assert_close(points, triangulate(*(given[cameras] for given in every), scale=0.01), equal_nan=True)
+
+
+def test_pairs_of_views_propose_points_a_few_at_a_time_as_all_at_once(monkeypatch: pytest.MonkeyPatch):
+    observations, truth = golf_session(cameras=5, frames=6, noise=Noise(1.0))
+    measurements = Measurements.of(observations)
+    rays = measurements.cameras[0].undistort(measurements.pixels[0].movedim(1, -1)).movedim(-1, 1)
+    generator = torch.Generator().manual_seed(0)
+    wrong = torch.rand(5, 1, rays.shape[2], generator=generator) < 0.3
+    rays = torch.where(wrong, rays + torch.randn(rays.shape, generator=generator, dtype=rays.dtype), rays)
+    given = (truth.rotations, truth.translations, rays, measurements.confidence[0])
+    assert truth.points is not None
+    at_once = triangulate_robustly(*given, scale=0.01)
+    monkeypatch.setattr(triangulation, "_POINTS_AT_ONCE", 1)
+    torch.testing.assert_close(triangulate_robustly(*given, scale=0.01), at_once)
+    expected, agreeing = truth.points.flatten(0, 1).mT, (~wrong).sum((0, 1)) >= 3
+    assert (at_once - expected).norm(dim=0)[agreeing].median() < 0.02
 
 
 def test_example_of_the_errors_runs():

@@ -13,6 +13,7 @@ from torchstickcal.model.objective import Objective
 from torchstickcal.model.state import State
 from torchstickcal.solvers import IterationRecord, Stop, Termination, gradients, solver
 from torchstickcal.solvers.elimination.normal_equations import NormalEquations
+from torchstickcal.solvers.newton import polish
 
 LOSSES: dict[str, dict[str, Loss]] = {
     "whitened": {"reprojection": ReprojectionLoss(1.0, kernel=GemanMcClure(8.0)), "length": StickLengthLoss(0.001)},
@@ -61,6 +62,22 @@ def test_the_last_step_is_confirmed_by_its_cost_alone(
     assert len(built) == len(states) - 1
     exact = run("gauss_newton", objective, disturbed[1]).iterations[0][-1].cost
     assert exact <= states[-1].cost <= exact * (1 + 10 * tolerance)
+
+
+def test_a_run_that_newton_follows_stops_earlier_and_ends_at_the_same_minimum(disturbed: tuple[Measurements, State]):
+    objective = Objective(disturbed[0], LOSSES["whitened"])
+
+    def ended(newton_follows: bool, max_iterations: int = 100) -> tuple[Stop, int, State]:
+        termination = Termination(max_iterations, cost_tolerance=1e-3, newton_follows=newton_follows)
+        outcome = run("gauss_newton", objective, disturbed[1], termination)
+        return outcome.stops[0], len(outcome.iterations[0]), polish(objective, outcome.state, cameras_free=True)
+
+    (_, steps, there), (stop, fewer, same) = ended(False), ended(True)
+    assert stop.converged
+    assert fewer < steps
+    torch.testing.assert_close(same.translations, there.translations, rtol=0, atol=1e-9)
+    torch.testing.assert_close(same.points, there.points, rtol=0, atol=1e-9)
+    assert ended(True, max_iterations=1)[0] == Stop.ITERATIONS  # nothing is known of the next step
 
 
 @pytest.mark.parametrize("name", ["gauss_newton", "lbfgs"])

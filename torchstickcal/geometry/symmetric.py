@@ -37,8 +37,8 @@ def outer(vectors: Tensor) -> Tensor:
 
 def symmetric_product(a: Tensor, b: Tensor) -> Tensor:
     """The six entries (..., 6, N) of a b^T + b a^T for vectors (..., 3, N)."""
-    pairs = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
-    return torch.stack([a[..., i, :] * b[..., j, :] + a[..., j, :] * b[..., i, :] for i, j in pairs], dim=-2)
+    rows = zip(a.split(1, dim=-2), b.split(1, dim=-2), range(3), strict=True)
+    return torch.cat([(own_a * b[..., i:, :]).addcmul(own_b, a[..., i:, :]) for own_a, own_b, i in rows], dim=-2)
 
 
 def gram(matrices: Tensor) -> Tensor:
@@ -104,5 +104,7 @@ def solve(entries: Tensor, rhs: Tensor) -> Tensor:
 
 def inverse_diagonal(entries: Tensor) -> Tensor:
     """Diagonals (..., 3, N) of the inverses of positive definite matrices (..., 6, N)."""
-    identity = torch.eye(3, dtype=entries.dtype, device=entries.device)[..., None]
-    return forward(cholesky(entries).unsqueeze(-3), identity).square().sum(-2)
+    r0, l10, l20, r1, l21, r2 = cholesky(entries).unbind(-2)
+    m10, m21 = -l10 * r0 * r1, -l21 * r1 * r2
+    m20 = -(l20 * r0 + l21 * m10) * r2
+    return torch.stack([r0 * r0 + m10 * m10 + m20 * m20, r1 * r1 + m21 * m21, r2 * r2], dim=-2)

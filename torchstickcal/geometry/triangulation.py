@@ -11,6 +11,8 @@ from torchstickcal.geometry.symmetric import IDENTITY, solve
 
 _MIN_DEPTH = 1e-3
 _MAX_PAIRS = 36
+_POINTS_AT_ONCE = 8_000
+"""Points that pairs of views propose at once: few points take as long as many, and many need memory."""
 _DOUBTFUL = 3.0
 """Residual of a view, in scales of the kernel, from which the point is triangulated again from pairs of views."""
 
@@ -37,18 +39,19 @@ def triangulate_robustly(
 
     def agreement(candidates: Tensor) -> Tensor:
         squared = _squared_residuals(rotations, translations, rays, candidates)
-        return (weights / (1 + squared / of_points.square())).nan_to_num().sum(0)
+        return (weights / (1 + squared / of_points.square())).nan_to_num().sum(-2)
 
     best = points[:, doubtful]
     score = agreement(best)
-    for pair in _pairs(len(rotations)):
-        both = weights[pair].amin(0) > 0
-        chosen = torch.zeros_like(weights)
-        chosen[pair] = both.to(weights)
-        candidates = triangulate(rotations[pair], translations[pair], rays[pair], chosen[pair], scale=torch.inf, iterations=2)
-        own = agreement(candidates)
-        better = both & (own > score)
-        best, score = torch.where(better, candidates, best), torch.where(better, own, score)
+    pairs = torch.tensor(_pairs(len(rotations)), device=rays.device)
+    for some in pairs.split(max(1, _POINTS_AT_ONCE // len(doubtful))):
+        both = weights[some].amin(1) > 0
+        given = rotations[some], translations[some], rays[some], both.to(weights)[:, None].expand(-1, 2, -1)
+        candidates = triangulate(*given, scale=torch.inf, iterations=2)
+        own, index = agreement(candidates.unsqueeze(-3)).where(both, -torch.inf).max(0)
+        better = own > score
+        chosen = candidates.gather(0, index.expand(1, 3, -1))[0]
+        best, score = torch.where(better, chosen, best), torch.where(better, own, score)
     points[:, doubtful] = triangulate(rotations, translations, rays, weights, scale=of_points, start=best)
     return points
 
@@ -60,11 +63,11 @@ def _pairs(cameras: int) -> list[list[int]]:
 
 
 def _squared_residuals(rotations: Tensor, translations: Tensor, rays: Tensor, points: Tensor) -> Tensor:
-    """Squared distances (C, N) in normalised image coordinates; infinite behind a camera."""
-    x, y, z = (rotations @ points + translations[..., None]).unbind(1)
+    """Squared distances (..., C, N) in normalised image coordinates; infinite behind a camera."""
+    x, y, z = (rotations @ points + translations[..., None]).unbind(-2)
     front = z > _MIN_DEPTH
     inverse = 1 / z.where(front, 1.0)
-    squared = (x * inverse - rays[:, 0]).square() + (y * inverse - rays[:, 1]).square()
+    squared = (x * inverse - rays[..., 0, :]).square() + (y * inverse - rays[..., 1, :]).square()
     return squared.where(front, torch.inf)
 
 
@@ -84,36 +87,38 @@ def triangulate(
     that their residuals are distances in the image, and the views are weighted by the Geman-McClure kernel.
 
     Args:
-        rotations: (C, 3, 3), world to camera.
-        translations: (C, 3), world to camera.
-        rays: undistorted, normalised image coordinates, (C, 2, N).
-        weights: (C, N), zero if a camera does not see the point.
+        rotations: (..., C, 3, 3), world to camera; leading dimensions are those of all arguments.
+        translations: (..., C, 3), world to camera.
+        rays: undistorted, normalised image coordinates, (..., C, 2, N).
+        weights: (..., C, N), zero if a camera does not see the point.
         scale: scale of the kernel, in normalised image coordinates. Views with a much larger residual have little weight.
         iterations: number of iterations.
+        start: points (..., 3, N) by which the views are weighted in the first iteration; None for the weights as given.
 
     Returns:
-        Points (3, N), NaN for points with fewer than two views.
+        Points (..., 3, N), NaN for points with fewer than two views.
     """
-    u, v = rays.unbind(1)
-    by_axis, offset = rotations.mT[..., None], translations[..., None]
-    rows = torch.stack([u[:, None] * by_axis[:, :, 2] - by_axis[:, :, 0], v[:, None] * by_axis[:, :, 2] - by_axis[:, :, 1]])
-    targets = torch.stack([offset[:, 0] - u * offset[:, 2], offset[:, 1] - v * offset[:, 2]])
-    xx, xy, xz = (rows[:, :, :1] * rows).sum(0).unbind(1)
-    yy, yz = (rows[:, :, 1] * rows[:, :, 1]).sum(0), (rows[:, :, 1] * rows[:, :, 2]).sum(0)
-    zz = (rows[:, :, 2] * rows[:, :, 2]).sum(0)
-    products = torch.stack([xx, xy, xz, yy, yz, zz], dim=1)
-    moments = (rows * targets[:, :, None]).sum(0)
-    unseen = (weights > 0).sum(0) < 2
+    u, v = rays.unbind(-2)
+    first, second, third = rotations[..., None].unbind(-3)
+    by_first, by_second, by_third = translations[..., None].unbind(-2)
+    rows = torch.stack([u.unsqueeze(-2) * third - first, v.unsqueeze(-2) * third - second])
+    targets = torch.stack([by_first - u * by_third, by_second - v * by_third])
+    products = torch.cat([(rows[..., axis : axis + 1, :] * rows[..., axis:, :]).sum(0) for axis in range(3)], dim=-2)
+    moments = (rows * targets.unsqueeze(-2)).sum(0)
+    unseen = ((weights > 0).sum(-2) < 2).unsqueeze(-2)
     identity = products.new_tensor(IDENTITY)[:, None]
     current = weights
     if start is not None:
-        current = weights / (1 + _squared_residuals(rotations, translations, rays, start) / scale / scale).square()
-    points = rays.new_zeros(3, rays.shape[2])
-    for _ in range(iterations):
-        hessian = torch.where(unseen, identity, (products * current[:, None]).sum(0))
-        points = solve(hessian, (moments * current[:, None]).sum(0))
-        depth = (rotations[:, 2] @ points + translations[:, 2:]).clamp_min(_MIN_DEPTH)
-        algebraic = (rows * points).sum(2) - targets
-        squared = algebraic.square().sum(0) / depth.square()
-        current = weights / (depth * (1 + squared / scale / scale)).square()
+        current = (
+            weights / (1 + _squared_residuals(rotations, translations, rays, start.unsqueeze(-3)) / scale / scale).square()
+        )
+    points = rays.new_empty(0)
+    for iteration in range(iterations):
+        if iteration:
+            depth = (rotations[..., 2, :] @ points + translations[..., 2:]).clamp_min(_MIN_DEPTH)
+            algebraic = (rows * points.unsqueeze(-3)).sum(-2) - targets
+            squared = algebraic.square().sum(0) / depth.square()
+            current = weights / (depth * (1 + squared / scale / scale)).square()
+        share = current.unsqueeze(-2)
+        points = solve(torch.where(unseen, identity, (products * share).sum(-3)), (moments * share).sum(-3))
     return points.where(~unseen, torch.nan)

@@ -196,7 +196,7 @@ def _binned_products(m: Measurements, tracks: Tensor, bins: Tensor) -> tuple[Ten
 def _by_lag(series: Tensor) -> Tensor:
     """Sums over tracks (B, P, tracks, F) of the products of values some lag apart, (B, P, F)."""
     frames = series.shape[-1]
-    power = torch.view_as_real(torch.fft.rfft(series, n=2 * frames)).square().sum((-3, -1), dtype=torch.float64)
+    power = torch.view_as_real(torch.fft.rfft(series, n=2 * frames)).square().sum(-3, dtype=torch.float64).sum(-1)
     return torch.fft.irfft(power, n=2 * frames)[..., :frames]
 
 

@@ -10,6 +10,7 @@ from torch import Tensor
 from torchstickcal.losses import SmoothnessLoss
 from torchstickcal.losses.track import combined, consecutive
 from torchstickcal.model.measurements import Measurements
+from torchstickcal.model.ranks import of_rank
 from torchstickcal.model.shrinkage import shrunk_logarithms
 
 NEAR_SIGMAS = 3.5
@@ -51,10 +52,13 @@ def near_keypoints(measurements: Measurements, squared_residuals: Tensor) -> Ten
     variance, views = _initial_variance(squared, visible), visible.sum(1)
     near = visible
     for iteration in range(_ITERATIONS):
+        before = near
         if iteration:
             variance = _variance(squared, near, measurements.num_cameras, NEAR_SIGMAS)
         near = visible & (squared <= (NEAR_SIGMAS**2 * variance[:, None] * _remaining_share(views))[:, None])
         near = near & (near.sum(1, keepdim=True) >= 2)
+        if iteration and torch.equal(near, before):  # and so it would stay
+            break
         views = near.sum(1)
     mask = torch.zeros_like(measurements.by_frame(measurements.visible))
     mask[:, :, _frames_looked_at(measurements)] = near
@@ -133,10 +137,10 @@ def _of_some_frames(measurements: Measurements, columns: Tensor) -> Tensor:
 
 def _variance(squared: Tensor, near: Tensor, cameras: int, cut: float) -> Tensor:
     """Variance of the keypoints (B, P), from squared residuals below a cut: of those that take part, both (B, C, F', P)."""
-    near = near & squared.isfinite()  # points that have moved behind a camera since the keypoints were chosen
-    by_point = (2 * near.sum(1) - 3).clamp_min(0)
-    moments = _truncated_moments(cameras, cut).to(squared)
-    expected = (by_point * moments[near.sum(1)]).sum(1).clamp_min(moments[2])
+    near = near & (squared < torch.inf)  # points that have moved behind a camera since the keypoints were chosen
+    views, moments = near.sum(1), _truncated_moments(cameras, cut).to(squared)
+    by_point = (2 * views - 3).clamp_min(0)
+    expected = (by_point * moments[views]).sum(1).clamp_min(moments[2])
     variance = squared.where(near, 0.0).sum((1, 2)) / expected
     return _shrink(variance.clamp_min(_MIN_SIGMA_PX**2), by_point.sum(1).to(squared))
 
@@ -151,8 +155,9 @@ def _initial_variance(squared: Tensor, visible: Tensor) -> Tensor:
     quartiles = _lower_quartiles(visible.shape[1]).to(squared)
     corrected = (squared / (_remaining_share(views) * quartiles[views])).where(visible, torch.nan).flatten(1, 2)
     corrected = corrected[:, :: -(-corrected.shape[1] // _MAX_SORTED)]
-    count = (~corrected.isnan()).sum(1, keepdim=True)
-    quartile = corrected.sort(dim=1).values.gather(1, (count // 4).clamp_max(corrected.shape[1] - 1))[:, 0]
+    known = ~corrected.isnan()
+    rank = (known.sum(1) // 4).clamp_max(corrected.shape[1] - 1)
+    quartile = of_rank(corrected.where(known, torch.inf).mT, rank[..., None])[..., 0]
     overall = quartile.where(quartile.isfinite(), torch.nan).nanmedian(1, keepdim=True).values.nan_to_num(nan=1.0)
     return quartile.where(quartile.isfinite(), overall).clamp_min(_MIN_SIGMA_PX**2)
 

@@ -110,7 +110,8 @@ class Trajectories:
         basis, products, powers = _basis(half_width, points.device)
         gram = (weights @ products).unflatten(1, (_DEGREES, _DEGREES)) + _RIDGE * torch.eye(_DEGREES).to(basis)
         lower = torch.linalg.cholesky_ex(gram).L
-        coefficients = torch.linalg.solve_triangular(lower, ((points * weights[:, None]) @ basis).mT, upper=False)
+        weighted = (points * weights[:, None]).contiguous()  # in one matrix product instead of one for each column
+        coefficients = torch.linalg.solve_triangular(lower, (weighted @ basis).mT, upper=False)
         determined = lower.diagonal(dim1=1, dim2=2) > _MIN_PIVOT
         coefficients = coefficients * determined[..., None]
         energies = coefficients.square().sum(2).flip(1).cumsum(1).flip(1)
@@ -129,7 +130,8 @@ class Trajectories:
         chi_square = ((points.square().sum(1) * weights).sum(1) - energies[:, 0]) * largest[:, 0]
         limit = degrees_of_freedom + _MAX_FIT_SIGMAS * (2 * degrees_of_freedom).sqrt()
         follows = (chi_square <= limit) & (degrees_of_freedom > 0)
-        return LocalPolynomials((powers @ shrunk).permute(1, 2, 0).contiguous(), high_degree_motion), follows
+        of_powers = shrunk.permute(2, 0, 1).contiguous() @ powers.mT
+        return LocalPolynomials(of_powers.permute(2, 0, 1).contiguous(), high_degree_motion), follows
 
 
 def _is_consistent(points: Tensor, variance: Tensor, views: Tensor) -> Tensor:

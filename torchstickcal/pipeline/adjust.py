@@ -15,6 +15,7 @@ from torch import Tensor
 
 from torchstickcal.config import Config, Stage
 from torchstickcal.model.measurements import Measurements
+from torchstickcal.model.ranks import nanquantile
 from torchstickcal.model.state import State
 from torchstickcal.model.unknowns import RigUnknowns, clock_refinements, with_refinements
 from torchstickcal.observations import Observations
@@ -45,9 +46,8 @@ says that one of them is wrong."""
 _EXACT = 1e-5
 """Cost tolerance of the stage for this comparison."""
 _MOST_SORTED = 100_003
-_ROUGHLY, _NEARLY = 1e-3, 1e-6
-"""Relative decrease of the cost from which on Newton's method can take over; and from which on what it still changes is
-negligible."""
+_ROUGHLY = 1e-3
+"""Relative decrease of the cost from which on Newton's method can take over."""
 _SETTLED = 0.1
 """Relative change of the numbers of keypoints that count as one, below which a stage need not be repeated with new ones."""
 
@@ -411,7 +411,7 @@ def _with_last_camera_stage(adjustment: Adjustment, run: Run) -> Adjustment:
     *_, last = run.camera_stages.items()
     least = 0.0
     if run.settles and not adjustment.asynchronous:
-        least = _ROUGHLY if run.to_rounding else _NEARLY
+        least = _ROUGHLY
     return _settled(_synchronised(through([last], adjustment, run, least), run), run)
 
 
@@ -514,7 +514,7 @@ def _small_squared_residuals(adjustment: Adjustment) -> Tensor:
     m = adjustment.measurements
     squared = m.squared_residuals(adjustment.state).double().where(m.visible, torch.nan).flatten(1)
     step = -(-squared.shape[1] // _MOST_SORTED)
-    return squared[:, ::step].nanquantile(0.25, dim=1)
+    return nanquantile(squared[:, ::step], 0.25)
 
 
 def relabelled(adjustment: Adjustment, run: Run) -> Adjustment:

@@ -99,7 +99,8 @@ def run_stage(
         measurements: the sessions.
         state: where it starts.
         run: what all steps share.
-        least: relative decrease of the cost from which on Gauss-Newton is near enough to the minimum.
+        least: relative decrease of the cost from which on Gauss-Newton is near enough to the minimum, because Newton's method
+            follows; 0 where it does not.
 
     Raises:
         CalibrationError: if it does not converge in a session, and the run must.
@@ -122,12 +123,13 @@ def run_stage(
     losses, levels, gates = noise.decided(measurements, state, squared_residuals, chosen)
     del squared_residuals
     objective = Objective(measurements, losses)
-    least = max(least if run.config.solver == "gauss_newton" else 0.0, _RESOLUTION[measurements.pixels.dtype])
+    least = least if run.config.solver == "gauss_newton" else 0.0
+    tolerance = max(stage.cost_tolerance, least, _RESOLUTION[measurements.pixels.dtype])
     outcome = solver(run.config.solver)(
         objective,
         state,
         cameras_free=stage.cameras == "free",
-        termination=Termination(stage.max_iterations, max(stage.cost_tolerance, least)),
+        termination=Termination(stage.max_iterations, tolerance, newton_follows=least > 0),
         stage=name,
         listener=run.listener,
     )

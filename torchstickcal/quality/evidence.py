@@ -177,7 +177,7 @@ class Evidence:
             seen = observations.keypoints[camera][observations.visible[camera]].double()
             if len(seen):
                 places = seen[:: 1 + len(seen) // _MOST_PLACES] / centre[camera] - 1
-                low, high = places.quantile(_MOST_SHARE[0], dim=0), places.quantile(_MOST_SHARE[1], dim=0)
+                low, high = places.quantile(places.new_tensor(_MOST_SHARE), dim=0)
                 outside = observations.image_size is None and bool((low.abs().maximum(high.abs()) > _OUTSIDE).any())
                 found[camera] = bool((high < 0).all()) or outside
         return found

@@ -40,11 +40,14 @@ class Termination:
         camera_tolerance: the solver has converged when the step of the cameras is below this, in standard deviations of the
             cameras. This criterion stops a run in which only poorly determined points still move, such as points with
             outliers.
+        newton_follows: whether Newton's method goes on from where the solver stops. It then stops as soon as the next step
+            promises to decrease the cost by less than the tolerance, without trying it, unless only one step is allowed.
     """
 
     max_iterations: int = 100
     cost_tolerance: float = 1e-9
     camera_tolerance: float = 1e-4
+    newton_follows: bool = False
 
 
 @dataclass(frozen=True)

@@ -102,8 +102,10 @@ class _SessionControl:
     def __init__(self, termination: Termination, exact_cost: float) -> None:
         self._termination, self._exact_cost = termination, exact_cost
         self._cost, self._predicted, self._damped_share, self._camera_sigmas = math.inf, 0.0, 0.0, math.inf
-        self._shrinkage = 1.0
-        """predicted decrease of the cost over that of the step before"""
+        hands_over = termination.newton_follows and termination.max_iterations > 1
+        self._shrinkage = 0.0 if hands_over else 1.0
+        """predicted decrease of the cost over that of the step before; for the first step, what is assumed"""
+        self._negligible_share = 1.0 if hands_over else _NEGLIGIBLE_SHARE
         self._trial_damping, self._factor, self._rejected = _INITIAL_DAMPING, _DECREASE, False
         self.damping = _INITIAL_DAMPING
         self.iteration = -1
@@ -157,7 +159,7 @@ class _SessionControl:
             self.damping = max(self.damping * _DECREASE, _MIN_DAMPING)
         else:
             self.has_trial = True
-            self._shrinkage = predicted / self._predicted if self._predicted else 1.0
+            self._shrinkage = predicted / self._predicted if self._predicted else self._shrinkage
             self._predicted, self._damped_share, self._camera_sigmas = predicted, damped_share, camera_sigmas
             self._trial_damping = self.damping
             self.damping = max(self.damping * self._factor, _MIN_DAMPING)
@@ -188,7 +190,7 @@ class _SessionControl:
         if self._damped_share >= _MAX_DAMPED_SHARE:
             return None
         shrinkage = max(self._shrinkage, (1 - decrease / self._predicted) ** 2)
-        if decrease <= limit or self._predicted * shrinkage <= _NEGLIGIBLE_SHARE * limit:
+        if decrease <= limit or self._predicted * shrinkage <= self._negligible_share * limit:
             return Stop.COST
         return Stop.CAMERAS if self._camera_sigmas * min(1.0, shrinkage**0.5) <= self._termination.camera_tolerance else None
 

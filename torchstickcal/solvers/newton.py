@@ -17,11 +17,13 @@ from torchstickcal.solvers.acceleration import Acceleration
 from torchstickcal.solvers.linearised import Linearised, Tangent, gradient_at
 
 _MAX_ROUNDS = 40
-_ROUNDING_SIGMAS, _NEAR_SIGMAS = 1e-7, 1e-3
-"""Length of a step, in standard deviations of the estimate, below which it is the last: for a minimum up to rounding errors, or
+_ROUNDING_SIGMAS, _NEAR_SIGMAS, _FLOAT32_SIGMAS = 1e-8, 1e-4, 1e-3
+"""Length of a step, in standard deviations of the estimate, below which it is the last: for a minimum up to rounding errors,
 near enough for everything but gradients, and as near as float32 allows."""
 _FAR_SIGMAS, _FAR_FROM_NEAR_SIGMAS = 1e-4, 1e-2
 """The same, above which steps that do not become shorter any more say that there is no minimum: rounding errors are smaller."""
+_REMAINING = 0.01
+"""What a step leaves, as a share of that length, below which it is the last as well: as much shorter as it was made shorter."""
 _SLOW, _OLD = 0.3, 3
 """Ratio of the lengths of two steps, and number of steps with one Hessian, from which on it is built anew."""
 
@@ -57,8 +59,8 @@ def minimum_near(
     at, acceleration = Linearised(objective_at(trial), trial, cameras_free), Acceleration()
     objective, gradient, age, age_of_step, back = at.objective, at.gradient, 0, 0, False
     is_double = objective.measurements.pixels.dtype == torch.float64
-    exact = to_rounding and is_double
-    tolerance, far = (_ROUNDING_SIGMAS, _FAR_SIGMAS) if exact else (_NEAR_SIGMAS, _FAR_FROM_NEAR_SIGMAS)
+    tolerance = _FLOAT32_SIGMAS if not is_double else _ROUNDING_SIGMAS if to_rounding else _NEAR_SIGMAS
+    far = _FAR_SIGMAS if tolerance == _ROUNDING_SIGMAS else _FAR_FROM_NEAR_SIGMAS
     shortest = torch.full_like(state.points[:, 0, 0], torch.inf)
     moving = torch.ones_like(shortest, dtype=torch.bool)
     for _ in range(_MAX_ROUNDS):
@@ -68,8 +70,9 @@ def minimum_near(
         slow = bool((moving & ~(length < _SLOW * shortest)).any())
         if not back:
             best = trial if bool((shorter | ~moving).all()) else best.replaced(moving & shorter, trial)
+            last = shorter & shortest.isfinite() & (length.square() <= _REMAINING * tolerance * shortest)
             shortest = torch.where(moving & shorter, length, shortest)
-            ended = moving & (shortest <= tolerance)
+            ended = moving & (last | (shortest <= tolerance))
             best = best.replaced(ended, _moved(best, step, -1.0)) if bool(ended.any()) else best
             moving &= ~ended & (shorter if age_of_step == 0 else True)
         if not bool(moving.any()):

@@ -14,7 +14,7 @@ from torchstickcal.model.measurements import Measurements
 from torchstickcal.model.state import State
 from torchstickcal.pipeline.initialise.graph import propagate, spanning_tree
 from torchstickcal.pipeline.initialise.pairs import relate
-from torchstickcal.pipeline.initialise.views import Views
+from torchstickcal.pipeline.initialise.views import Views, undistorted_keypoints
 
 __all__ = ["initialise", "triangulated"]
 
@@ -38,10 +38,16 @@ def initialise(measurements: Measurements, settings: InitialiseSettings, labels:
     edges = spanning_tree(views.common(), relate_pair, labels, settings.min_common_points)
     poses = propagate(edges, views, _kernel_scale(measurements, settings))
     rotations, translations = (torch.from_numpy(pose)[None].to(measurements.pixels.device) for pose in poses)
-    return State.of(rotations, translations, triangulated(measurements, rotations, translations, settings))
+    return State.of(rotations, translations, triangulated(measurements, rotations, translations, settings, views))
 
 
-def triangulated(measurements: Measurements, rotations: Tensor, translations: Tensor, settings: InitialiseSettings) -> Tensor:
+def triangulated(
+    measurements: Measurements,
+    rotations: Tensor,
+    translations: Tensor,
+    settings: InitialiseSettings,
+    views: Views | None = None,
+) -> Tensor:
     """Triangulated points (1, 3, N) of one session, zero if fewer than two cameras see a point.
 
     Args:
@@ -49,12 +55,12 @@ def triangulated(measurements: Measurements, rotations: Tensor, translations: Te
         rotations: (1, C, 3, 3), world to camera.
         translations: (1, C, 3), world to camera.
         settings: thresholds.
+        views: of the session, which may know its keypoints without distortion; None without any.
     """
-    scale = _kernel_scale(measurements, settings)
+    scale, undistorted = _kernel_scale(measurements, settings), None if views is None else views.undistorted
     points = rotations.new_zeros(1, 3, measurements.num_columns)
     for columns in measurements.chunks():
-        pixels = measurements.pixels[0][..., columns].double().movedim(1, -1)
-        rays = measurements.cameras[0].undistort(pixels).movedim(-1, 1)
+        rays = undistorted_keypoints(measurements, columns) if undistorted is None else undistorted[..., columns]
         weights = measurements.confidence[0][:, columns].double() * rays.isfinite().all(1)
         chunk = triangulate_robustly(rotations[0], translations[0], rays.nan_to_num(), weights, scale=scale)
         points[0, :, columns] = chunk.nan_to_num()

@@ -147,10 +147,9 @@ def propagate(edges: Sequence[Edge], views: Views, scale: float) -> tuple[Array,
 def _doubtful(rotations: Array, translations: Array, rays: Array, visible: NDArray[np.bool_], scale: float) -> list[int]:
     """The cameras that the points of all others contradict, the least supported first; none of two."""
     shares: dict[int, float] = {}
-    for camera in range(len(rays)) if len(rays) > 2 else ():
-        # points that most views agree on take longer, and are needed only where plain ones do not do
-        plain = _supported(camera, rotations, translations, rays, visible, scale, triangulate).share
-        if plain < _SOUND_SHARE:
+    # points that most views agree on take longer, and are needed only where plain ones do not do
+    for camera, plain in enumerate(_points_by_others(rotations, translations, rays, visible, scale) if len(rays) > 2 else ()):
+        if _support(camera, plain, rotations, translations, rays, visible, scale).share < _SOUND_SHARE:
             shares[camera] = _supported(camera, rotations, translations, rays, visible, scale).share
     return [camera for camera in sorted(shares, key=lambda c: shares[c]) if shares[camera] < _SOUND_SHARE]
 
@@ -215,32 +214,48 @@ class _Support(NamedTuple):
 
 
 def _supported(
+    camera: int, rotations: Array, translations: Array, rays: Array, visible: NDArray[np.bool_], scale: float
+) -> _Support:
+    """The support of a camera by the points that most of the others agree on."""
+    others = [other for other in range(len(rays)) if other != camera]
+    known = _points(triangulate_robustly, others, rotations, translations, rays, visible, scale)
+    return _support(camera, known, rotations, translations, rays, visible, scale)
+
+
+def _support(
     camera: int,
+    known: Array,
     rotations: Array,
     translations: Array,
     rays: Array,
     visible: NDArray[np.bool_],
     scale: float,
-    method: Callable[..., torch.Tensor] = triangulate_robustly,
 ) -> _Support:
-    """The support of a camera by the points of all others, triangulated by a method."""
-    others = [other for other in range(len(rays)) if other != camera]
-    known = _points(method, others, rotations, translations, rays, visible, scale)
+    """The support of a camera by points (3, n) of all others."""
     seen = np.flatnonzero(visible[camera] & np.isfinite(known).all(0))
     weights = _kernel_weights(rotations[camera], translations[camera], known[:, seen], rays[camera][:, seen], scale)
     return _Support(float(weights.mean()) if len(seen) else 1.0, known, seen)
 
 
+def _points_by_others(rotations: Array, translations: Array, rays: Array, visible: NDArray[np.bool_], scale: float) -> Array:
+    """For each of the cameras, the points that the others see, (C, 3, n); NaN where fewer than two of them do."""
+    others = np.array([[other for other in range(len(rays)) if other != camera] for camera in range(len(rays))])
+    return _points(triangulate, others, rotations, translations, rays, visible, scale)
+
+
 def _points(
     method: Callable[..., torch.Tensor],
-    cameras: list[int],
+    cameras: list[int] | NDArray[np.int_],
     rotations: Array,
     translations: Array,
     rays: Array,
     visible: NDArray[np.bool_],
     scale: float,
 ) -> Array:
-    """Points (3, n) that some of the cameras see, triangulated by a method; NaN where fewer than two of them do."""
+    """Points (3, n) that some of the cameras see, triangulated by a method; NaN where fewer than two of them do.
+
+    Several rows of cameras, of the same number, give several such sets of points, (..., 3, n).
+    """
     known = (torch.from_numpy(of_cameras[cameras]) for of_cameras in (rotations, translations, rays))
     return method(*known, torch.from_numpy(visible[cameras]).double(), scale=scale).numpy()
 

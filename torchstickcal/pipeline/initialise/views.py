@@ -5,9 +5,11 @@ from __future__ import annotations
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from torch import Tensor
 
 from torchstickcal.lazy import cached_property
 from torchstickcal.model.measurements import Measurements
+from torchstickcal.model.unknowns import Columns
 
 Array = NDArray[np.float64]
 
@@ -33,7 +35,10 @@ class Views:
         """(C, N)"""
         self.focal_px: Array = measurements.cameras.focal_px[0].cpu().numpy()
         """(C,)"""
-        self._cache = self._undistorted(slice(None), slice(None)) if self.visible.size <= _MAX_CACHED_KEYPOINTS else None
+        every = slice(None)
+        self.undistorted = undistorted_keypoints(measurements, every) if self.visible.size <= _MAX_CACHED_KEYPOINTS else None
+        """(C, 2, N), normalised image coordinates; None of a long session"""
+        self._cache = None if self.undistorted is None else self.undistorted.cpu().numpy()
 
     def common(self) -> NDArray[np.int_]:
         """Number of common points of each pair of cameras, (C, C)."""
@@ -64,13 +69,17 @@ class Views:
 
         Keypoints that the distortion model cannot produce count as not seen.
         """
-        rays = self._undistorted(cameras, columns) if self._cache is None else self._cache[cameras][:, :, columns]
+        if self._cache is None:
+            rays = undistorted_keypoints(self._measurements, torch.from_numpy(columns), cameras).cpu().numpy()
+        else:
+            rays = self._cache[cameras][:, :, columns]
         return np.nan_to_num(rays), self.visible[cameras][:, columns] & np.isfinite(rays).all(1)
 
-    def _undistorted(self, cameras: list[int] | slice, columns: NDArray[np.intp] | slice) -> Array:
-        m = self._measurements
-        pixels = m.pixels[0][cameras][:, :, columns].double().movedim(1, -1)
-        return m.cameras[0][cameras].undistort(pixels).movedim(-1, 1).cpu().numpy()
+
+def undistorted_keypoints(measurements: Measurements, columns: Columns, cameras: list[int] | slice = slice(None)) -> Tensor:
+    """Normalised image coordinates (c, 2, n) of the keypoints of some columns of one session, by default in all cameras."""
+    pixels = measurements.pixels[0][cameras][:, :, columns].double().movedim(1, -1)
+    return measurements.cameras[0][cameras].undistort(pixels).movedim(-1, 1)
 
 
 def spread(count: int, limit: int) -> NDArray[np.intp]:

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from torchstickcal.model.measurements import Measurements
+from torchstickcal.model.ranks import nanquantile
 from torchstickcal.model.state import State
 from torchstickcal.observations import Observations
 from torchstickcal.pipeline.relabel.exchanges import Exchange, exchanges
@@ -235,6 +236,6 @@ def _noise(squared: Tensor, visible: Tensor) -> Tensor:
     squared, visible = squared[:, frames].double(), visible[:, frames]
     views = visible.sum(0)
     known = (squared * (2 * views / (2 * views - 3).clamp_min(1))).where(visible, torch.nan).flatten(0, 1)
-    overall, each = known.nanquantile(_SHARE), known.nanquantile(_SHARE, dim=0)
+    overall, each = nanquantile(known.flatten()[None], _SHARE)[0], nanquantile(known.mT, _SHARE)
     each = each.where(each.isfinite(), overall).clamp(overall / _LARGEST_RATIO**2, overall * _LARGEST_RATIO**2)
     return (each / _QUANTILE_CHI2_2).sqrt().clamp_min(_LEAST_NOISE_PX)

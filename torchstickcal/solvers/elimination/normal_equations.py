@@ -289,11 +289,13 @@ class NormalEquations(Evaluated):
             self._add_track_gradient(name, terms)
             stencil, frames = self.objective.track_losses[name].stencil, terms.scale.shape[1]
             information = terms.scale.square().to(hessian.dtype)
+            own = torch.zeros_like(hessian[:, 0])
             for i, factor in enumerate(stencil):
-                for axis in DIAGONAL:
-                    hessian[:, axis, i : i + frames] += factor**2 * information
+                own[:, i : i + frames].add_(information, alpha=factor**2)
                 for j, other in enumerate(stencil[i + 1 :], i + 1):
-                    between[j - i - 1][:, i : i + frames] += factor * other * information
+                    between[j - i - 1][:, i : i + frames].add_(information, alpha=factor * other)
+            for axis in DIAGONAL:
+                hessian[:, axis] += own
         return BetweenFrames(*between)
 
     def _add_camera_point_losses(self) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Protocol
@@ -12,7 +13,7 @@ from torch import Tensor
 from torchstickcal.model.measurements import Measurements
 from torchstickcal.model.unknowns import Columns
 from torchstickcal.solvers.elimination.points import PointElimination
-from torchstickcal.solvers.elimination.tracks import TrackElimination
+from torchstickcal.solvers.elimination.tracks import TrackElimination, Tracks, rows_per_block
 
 _MAX_TRACK_POINTS = 3000
 """Number of points of the tracks that are eliminated together. Their right-hand sides should fit into the cache."""
@@ -102,11 +103,11 @@ def parts(measurements: Measurements, clusters: Sequence[Cluster], couplings: Co
 
 
 def _batches(clusters: Sequence[Cluster], max_length: int) -> list[list[Cluster]]:
-    """Batches of at most ``max_length`` clusters, all of the same size."""
+    """Batches of at most ``max_length`` clusters that can be eliminated together, small ones first."""
     batches: list[list[Cluster]] = []
-    for size in sorted({len(cluster) for cluster in clusters}):
-        equal = [cluster for cluster in clusters if len(cluster) == size]
-        batches += [equal[first : first + max_length] for first in range(0, len(equal), max_length)]
+    for rows in sorted({rows_per_block(len(cluster)) for cluster in clusters}):
+        alike = sorted((cluster for cluster in clusters if rows_per_block(len(cluster)) == rows), key=len)
+        batches += [alike[first : first + max_length] for first in range(0, len(alike), max_length)]
     return batches
 
 
@@ -140,37 +141,47 @@ class _PointsAndPairs:
 
 
 class _Clusters:
-    """T clusters of q points each, in some frames. The columns are in the order cluster, frame, member."""
+    """Clusters of points, in some frames. The columns are in the order size, cluster, frame, member."""
 
     def __init__(self, measurements: Measurements, clusters: Sequence[Cluster], frames: slice, couplings: Couplings) -> None:
         m, device = measurements, measurements.pixels.device
-        self._clusters, self._frames, self._couplings = clusters, frames, couplings
-        self._points = torch.tensor(clusters, device=device)
+        self._frames, self._couplings = frames, couplings
+        self._by_size = [list(equal) for _, equal in itertools.groupby(clusters, key=len)]
+        self._points = [torch.tensor(equal, device=device) for equal in self._by_size]
         frame_start = m.points_per_frame * torch.arange(frames.start, frames.stop, device=device)[:, None]
-        self.columns: Columns = (self._points[:, None] + frame_start).flatten()
+        self.columns: Columns = torch.cat([(points[:, None] + frame_start).flatten() for points in self._points])
         self.chunks: list[Columns] = list(self.columns.split(max(1, m.chunk_keypoints // (m.sessions * m.num_cameras))))
 
     def eliminate(self, hessian: Tensor) -> TrackElimination:
-        between, frames = self._couplings.between, self._frames.stop - self._frames.start
-        by_track = hessian.unflatten(-1, (len(self._clusters), frames, -1))
-        factors = None
-        if between is not None:
-            next_frame, second_frame = (f[..., self._points].to(hessian) for f in (between.next_frame, between.second_frame))
-            factors = next_frame, second_frame
-        return TrackElimination(by_track, self._within_blocks(hessian, frames), factors)
+        frames = self._frames.stop - self._frames.start
+        own = hessian.split([frames * points.numel() for points in self._points], dim=-1)
+        return TrackElimination([self._tracks(number, by_size, frames) for number, by_size in enumerate(own)])
 
-    def _within_blocks(self, like: Tensor, frames: int) -> Tensor | None:
+    def _tracks(self, number: int, hessian: Tensor, frames: int) -> Tracks:
+        """The clusters of one size as tracks; without a loss that couples frames, each frame as a track of its own."""
+        between, points = self._couplings.between, self._points[number]
+        by_track = hessian.unflatten(-1, (len(points), frames, -1))
+        within = self._within_blocks(number, hessian, frames)
+        if between is None:
+            none = hessian.new_zeros(len(hessian), 0, len(points) * frames, points.shape[1])
+            return Tracks(
+                by_track.flatten(2, 3).unsqueeze(3), None if within is None else within.flatten(1, 2)[:, :, None], none, none
+            )
+        return Tracks(by_track, within, *(f[..., points].to(hessian) for f in (between.next_frame, between.second_frame)))
+
+    def _within_blocks(self, number: int, like: Tensor, frames: int) -> Tensor | None:
         """The blocks between the points of each cluster, (B, T, F, 3 q, 3 q), zero on the diagonal; None for single points."""
-        size = len(self._clusters[0])
+        clusters = self._by_size[number]
+        size = len(clusters[0])
         if size == 1:
             return None
-        blocks = like.new_zeros(len(like), len(self._clusters), frames, 3 * size, 3 * size)
-        for number, cluster in enumerate(self._clusters):
+        blocks = like.new_zeros(len(like), len(clusters), frames, 3 * size, 3 * size)
+        for row_of_blocks, cluster in enumerate(clusters):
             for i, row in enumerate(cluster):
                 for j, column in enumerate(cluster[i + 1 :], i + 1):
                     block = self._couplings.within.between(row, column)
                     if block is not None:
                         by_frame = block[..., self._frames].movedim(-1, 1).to(like.dtype)
-                        blocks[:, number, :, 3 * i : 3 * i + 3, 3 * j : 3 * j + 3] = by_frame
-                        blocks[:, number, :, 3 * j : 3 * j + 3, 3 * i : 3 * i + 3] = by_frame.mT
+                        blocks[:, row_of_blocks, :, 3 * i : 3 * i + 3, 3 * j : 3 * j + 3] = by_frame
+                        blocks[:, row_of_blocks, :, 3 * j : 3 * j + 3, 3 * i : 3 * i + 3] = by_frame.mT
         return blocks
