@@ -184,9 +184,10 @@ class TestPatch:
             np.testing.assert_allclose(centre, [30, 30], atol=0.25)
 
     @pytest.mark.parametrize("turned_deg", [0.0, 120.0])
-    def test_no_centre_where_one_side_is_covered(self, turned_deg: float):
+    def test_a_side_that_is_covered_is_noticed(self, turned_deg: float):
         patch, axis = ball(4.0, turned_deg, covered=True)
-        assert patch.centre_on(axis) is None
+        assert patch.is_covered(axis)
+        assert not ball(4.0, turned_deg)[0].is_covered(axis)
 
 
 class TestShaft:

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from torchstickcal.errors import CalibrationError
 from torchstickcal.registry import suggestion
+from torchstickcal.video.ball import discs_of
 from torchstickcal.video.frames import Image
 from torchstickcal.video.patch import Patch
 
@@ -46,6 +47,8 @@ _AREA_FRAMES = 6
 _LEAST_SCORE = 0.02
 _RIVAL = 0.4
 """A second thing of that colour, of this share of the area of the first one, makes a frame ambiguous."""
+_ROUND, _LEAST_ROUND = 0.15, 0.7
+"""Misfit of a disc up to which a marker is a ball, and share of its images in which a disc must be found."""
 _NO_DIRECTION_PX = 3.0
 _NEIGHBOURS = 4
 _JUMP_PX = 6.0
@@ -64,7 +67,9 @@ class Candidate:
     y: float
     area_px: float
     streak_px: float
-    """length of the streak"""
+    """length of what is seen"""
+    blur_px: float = 0.0
+    """by how much it is longer than wide"""
     patch: Patch | None = None
     """its pixels"""
 
@@ -234,7 +239,8 @@ def _markers_in(
         spread = np.cov(np.stack([columns, rows]), aweights=weights)
         width, length = np.sqrt(12 * np.maximum(np.linalg.eigvalsh(spread), 0.0)) + 1e-9
         if peak >= _PURITY * min(1.0, width / max(length - width, 1e-9)):
-            found.append(Candidate(x + corner[0], y + corner[1], area, float(length), Patch(mine, other, corner)))
+            blur = float(np.sqrt(max(length**2 - width**2, 0.0)))
+            found.append(Candidate(x + corner[0], y + corner[1], area, float(length), blur, Patch(mine, other, corner)))
     return found
 
 
@@ -267,28 +273,75 @@ class TapeTrack:
 def ends_of(tracks: Sequence[TapeTrack]) -> list[Array]:
     """Of the marker of each track (F, 3): x and y in pixels, and a score; NaN, NaN, 0 where no end is sure.
 
-    The direction of the stick is that from one marker to the other, or from the hands to the last marker. The score is lower
-    where a marker is seen along the stick, or where that direction is not known: the stick itself may hide a part of it.
+    The direction of the stick is that from one marker to the other, or from the hands to the last marker. Markers that look
+    like balls are fitted by discs, others are centred by symmetry along the stick. The score is the information about the
+    centre, relative to the best frames: it is lower where less of the outline is seen. It is least where the direction is not
+    known, because the stick itself may hide a part.
     """
     chosen = [track.chosen() for track in tracks]
-    ends = [np.full((len(track.found), 3), [np.nan, np.nan, 0.0]) for track in tracks]
-    for number, (track, own) in enumerate(zip(tracks, chosen, strict=True)):
-        areas = [c.area_px for c in own if c is not None]
-        whole = float(np.percentile(areas, 90)) if areas else np.nan
-        for frame, candidate in enumerate(own):
-            if candidate is None:
-                continue
-            others = [c[frame] for k, c in enumerate(chosen) if k != number]
-            axis = _axis(candidate, others, track.near[frame] if number == len(tracks) - 1 else None)
-            centre: Array | None = np.array([candidate.x, candidate.y])
-            score = np.clip((candidate.area_px / whole) ** 2, _LEAST_SCORE, 1.0)
-            if candidate.patch is not None and axis is not None:
-                centre = candidate.patch.centre_on(axis)
-            elif others:
-                score = _LEAST_SCORE
-            if centre is not None:
-                ends[number][frame] = *centre, score
+    return [_centres(number, chosen, track.near if number == len(tracks) - 1 else None) for number, track in enumerate(tracks)]
+
+
+def _centres(
+    number: int, chosen: Sequence[Sequence[Candidate | None]], hands: Sequence[tuple[float, float, float] | None] | None
+) -> Array:
+    """The ends (F, 3) of one of the markers, with candidates ``chosen`` for all of them."""
+    own = chosen[number]
+    others = [[track[frame] for k, track in enumerate(chosen) if k != number] for frame in range(len(own))]
+    axes = [
+        None if c is None else _axis(c, others[frame], None if hands is None else hands[frame]) for frame, c in enumerate(own)
+    ]
+    patches = [
+        None if c is None or c.patch is None or (axis is not None and c.patch.is_covered(axis)) else c.patch
+        for c, axis in zip(own, axes, strict=True)
+    ]
+    discs = discs_of(patches, axes, _streaks(own), _AREA_FRAMES)
+    misfits = [disc.misfit for disc in discs if disc is not None]
+    is_ball = len(misfits) >= _LEAST_ROUND * sum(patch is not None for patch in patches) > 0
+    is_ball = is_ball and float(np.median(misfits)) < _ROUND
+    areas = [c.area_px for c in own if c is not None]
+    whole = float(np.percentile(areas, 90)) if areas else np.nan
+    best_px = float(np.percentile([disc.sigma_px for disc in discs if disc is not None], 10)) if is_ball else np.nan
+    ends = np.full((len(own), 3), [np.nan, np.nan, 0.0])
+    for frame, (candidate, patch, axis, disc) in enumerate(zip(own, patches, axes, discs, strict=True)):
+        if candidate is None:
+            continue
+        centre: Array | None = None
+        score = (candidate.area_px / whole) ** 2
+        if candidate.patch is None:
+            centre = np.array([candidate.x, candidate.y])
+        elif is_ball and disc is not None:
+            centre, score = disc.centre, (best_px / disc.sigma_px) ** 2
+        elif not is_ball and patch is not None:
+            centre = patch.centre if axis is None else patch.centre_on(axis)
+        if centre is not None:
+            unclear = axis is None and len(chosen) > 1
+            ends[frame] = *centre, _LEAST_SCORE if unclear else np.clip(score, _LEAST_SCORE, 1.0)
     return ends
+
+
+def _streaks(own: Sequence[Candidate | None]) -> Array:
+    """Motion (F, 2) of a marker during the exposures, pixels: a share of the way to the neighbouring frames.
+
+    The share is the same in all frames: it is the median of those in which the marker is fast.
+    """
+    places = np.array([(c.x, c.y) if c else (np.nan, np.nan) for c in own]).reshape(-1, 2)
+    motion = np.array([_motion(places, frame) for frame in range(len(own))]).reshape(-1, 2)
+    speed = np.linalg.norm(motion, axis=-1)
+    if not speed.any():
+        return motion
+    fast = speed > 0.5 * np.percentile(speed[speed > 0], 95)
+    blur = np.array([c.blur_px if c else 0.0 for c in own])
+    return motion * float(np.clip(np.median(blur[fast] / speed[fast]), 0.0, 1.0))
+
+
+def _motion(places: Array, frame: int) -> Array:
+    """Pixels (2,) from one frame to the next, by the parabola through the places (F, 2) around a frame; 0 where not known."""
+    around = np.arange(max(0, frame - 2), min(len(places), frame + 3))
+    around = around[np.isfinite(places[around, 0])]
+    if len(around) < 2 or not np.isfinite(places[frame, 0]):
+        return np.zeros(2)
+    return np.polynomial.polynomial.polyfit(around - frame, places[around], min(2, len(around) - 1))[1]
 
 
 def _axis(candidate: Candidate, others: Sequence[Candidate | None], hands: tuple[float, float, float] | None) -> Array | None:
