@@ -44,6 +44,10 @@ _LEAST_RADIUS_PX = 1.0
 _LEAST_SIGMA_PX = 0.03
 _MOST_MISFIT = 0.25
 _MOST_SIGMA_PX = 0.6
+_MOST_HIDDEN = 0.4
+"""A stick hides less of a ball."""
+_SIZES, _LONG = 1.4, 5
+"""Ratio of the radius to the usual one in so many times more frames than those that determine the radius"""
 _MOST_ASIDE = 0.7
 """How far from the centre of what is seen the centre of the disc can be, as a share of the radius."""
 
@@ -98,7 +102,8 @@ def disc_in(patch: Patch, axis: Array | None, streak: Array, radius: tuple[float
     sigma_px = float(np.sqrt(np.linalg.eigvalsh(covariance[:2, :2])[-1]))
     misfit = float(np.sqrt(np.square(rest[used]).mean()))
     aside = float(np.linalg.norm(found[:2] - seen))
-    if sigma_px > _MOST_SIGMA_PX or misfit > _MOST_MISFIT or aside > _MOST_ASIDE * found[2]:
+    hidden = 1 - float(shares.sum() / disc.sum())
+    if sigma_px > _MOST_SIGMA_PX or misfit > _MOST_MISFIT or aside > _MOST_ASIDE * found[2] or hidden > _MOST_HIDDEN:
         return None
     return Disc(found[:2], float(found[2]), sigma_px, float(np.sqrt(covariance[2, 2])), misfit)
 
@@ -111,11 +116,20 @@ def discs_of(patches: Sequence[Patch | None], axes: Sequence[Array | None], stre
         streaks: (F, 2). reach: how many frames before and after one say how large the disc is in it.
     """
     alone = [None if patch is None else disc_in(patch, axis, s) for patch, axis, s in zip(patches, axes, streaks, strict=True)]
-    found = []
+    whole = [disc if _is_usual(disc, alone, frame, _LONG * reach) else None for frame, disc in enumerate(alone)]
+    found: list[Disc | None] = []
     for frame, patch in enumerate(patches):
-        radius = _radius_at(alone, frame, reach)
-        found.append(None if patch is None else disc_in(patch, axes[frame], streaks[frame], radius))
+        usable = patch is not None and whole[frame] is not None
+        found.append(disc_in(patch, axes[frame], streaks[frame], _radius_at(whole, frame, reach)) if usable else None)
     return found
+
+
+def _is_usual(disc: Disc | None, discs: Sequence[Disc | None], frame: int, reach: int) -> bool:
+    """Whether a disc is not much smaller or larger than those of many frames around it: for long, a part may be hidden."""
+    if disc is None:
+        return False
+    usual = float(np.median([d.radius_px for d in discs[max(0, frame - reach) : frame + reach + 1] if d is not None]))
+    return usual / _SIZES < disc.radius_px < usual * _SIZES
 
 
 def _radius_at(discs: Sequence[Disc | None], frame: int, reach: int) -> tuple[float, float] | None:
