@@ -1,6 +1,6 @@
 """The centre of a ball of which the stick may hide a part: that of the disc whose outline fits what is seen of it.
 
-The centre of what is seen is not that of the ball. Where the stick points at the camera, its near half hides a part of the ball,
+What is seen is not centred on the ball. Where the stick points at the camera, its near half hides a part of the ball,
 and compression blurs colours over two pixels, so that they are wrong beside the stick too. All of that takes no part. The rest
 of the outline says where the disc is and how large. How large it is follows from the neighbouring frames too.
 """

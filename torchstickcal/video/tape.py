@@ -47,8 +47,6 @@ _AREA_FRAMES = 6
 _LEAST_SCORE = 0.02
 _RIVAL = 0.4
 """A second thing of that colour, of this share of the area of the first one, makes a frame ambiguous."""
-_ROUND, _LEAST_ROUND = 0.15, 0.7
-"""Misfit of a disc up to which a marker is a ball, and share of its images in which a disc must be found."""
 _NO_DIRECTION_PX = 3.0
 _NEIGHBOURS = 4
 _JUMP_PX = 6.0
@@ -84,13 +82,13 @@ class Background:
     """by name, blue, green, red; None where nothing of that colour moves"""
 
 
-def check_colours(names: Sequence[str]) -> None:
+def check_colours(names: Sequence[str], option: str = "--tape") -> None:
     """Raise a CalibrationError for names that are no colours, or are given twice."""
     unknown = [name for name in names if name not in HUES]
     if unknown or len(set(names)) != len(names) or not names:
         raise CalibrationError(
-            "unusable colours of tape",
-            where="--tape",
+            "unusable colours of marks",
+            where=option,
             got=",".join(names),
             expected=f"different ones of {', '.join(HUES)}",
             remedy=suggestion(unknown[0], HUES) if unknown else "",
@@ -270,53 +268,69 @@ class TapeTrack:
         return [c if sure else None for c, sure in zip(chosen, np.isfinite(follow[:, 0]), strict=True)]
 
 
-def ends_of(tracks: Sequence[TapeTrack]) -> list[Array]:
+def ends_of(tracks: Sequence[TapeTrack], balls: bool = False) -> list[Array]:
     """Of the marker of each track (F, 3): x and y in pixels, and a score; NaN, NaN, 0 where no end is sure.
 
-    The direction of the stick is that from one marker to the other, or from the hands to the last marker. Markers that look
-    like balls are fitted by discs, others are centred by symmetry along the stick. The score is the information about the
-    centre, relative to the best frames: it is lower where less of the outline is seen. It is least where the direction is not
-    known, because the stick itself may hide a part.
+    The direction of the stick is that from one marker to the other, or from the hands to the last marker. Balls are fitted by
+    discs, bands are centred by their symmetry. The score is lower where less of a marker is seen. It is least where the
+    direction is not known, because the stick itself may hide a part.
+
+    Args:
+        tracks: of the markers on a stick.
+        balls: whether the markers are balls.
     """
     chosen = [track.chosen() for track in tracks]
-    return [_centres(number, chosen, track.near if number == len(tracks) - 1 else None) for number, track in enumerate(tracks)]
+    return [
+        _centres(number, chosen, track.near if number == len(tracks) - 1 else [None] * len(track.near), balls)
+        for number, track in enumerate(tracks)
+    ]
 
 
 def _centres(
-    number: int, chosen: Sequence[Sequence[Candidate | None]], hands: Sequence[tuple[float, float, float] | None] | None
+    number: int,
+    chosen: Sequence[Sequence[Candidate | None]],
+    hands: Sequence[tuple[float, float, float] | None],
+    balls: bool,
 ) -> Array:
-    """The ends (F, 3) of one of the markers, with candidates ``chosen`` for all of them."""
+    """The ends (F, 3) of one of the markers; ``chosen`` has the candidates of all of them."""
     own = chosen[number]
     others = [[track[frame] for k, track in enumerate(chosen) if k != number] for frame in range(len(own))]
-    axes = [
-        None if c is None else _axis(c, others[frame], None if hands is None else hands[frame]) for frame, c in enumerate(own)
-    ]
+    axes = [None if c is None else _axis(c, *where) for c, *where in zip(own, others, hands, strict=True)]
+    ends = _by_discs(own, axes) if balls else _by_symmetry(own, axes)
+    unclear = np.array([axis is None for axis in axes]) & (len(chosen) > 1)
+    ends[:, 2] = np.where(unclear, _LEAST_SCORE, np.clip(ends[:, 2], _LEAST_SCORE, 1.0))
+    ends[np.isnan(ends[:, 0]), 2] = 0.0
+    return ends
+
+
+def _by_symmetry(own: Sequence[Candidate | None], axes: Sequence[Array | None]) -> Array:
+    """Centres and scores (F, 3) of what is seen of a marker, along the stick of what is beside the stick."""
+    areas = np.array([np.nan if c is None else c.area_px for c in own])
+    whole = np.percentile(areas[np.isfinite(areas)], 90) if np.isfinite(areas).any() else np.nan
+    ends = np.full((len(own), 3), np.nan)
+    for frame, (candidate, axis) in enumerate(zip(own, axes, strict=True)):
+        if candidate is None:
+            continue
+        centre: Array | None = np.array([candidate.x, candidate.y])
+        if candidate.patch is not None and axis is not None:
+            centre = None if candidate.patch.is_covered(axis) else candidate.patch.centre_on(axis)
+        if centre is not None:
+            ends[frame] = *centre, (candidate.area_px / whole) ** 2
+    return ends
+
+
+def _by_discs(own: Sequence[Candidate | None], axes: Sequence[Array | None]) -> Array:
+    """Centres and scores (F, 3) of a ball: of the discs that fit its outline. The score is how well the outline determines the
+    centre, as a variance relative to the best frames."""
     patches = [
         None if c is None or c.patch is None or (axis is not None and c.patch.is_covered(axis)) else c.patch
         for c, axis in zip(own, axes, strict=True)
     ]
     discs = discs_of(patches, axes, _streaks(own), _AREA_FRAMES)
-    misfits = [disc.misfit for disc in discs if disc is not None]
-    is_ball = len(misfits) >= _LEAST_ROUND * sum(patch is not None for patch in patches) > 0
-    is_ball = is_ball and float(np.median(misfits)) < _ROUND
-    areas = [c.area_px for c in own if c is not None]
-    whole = float(np.percentile(areas, 90)) if areas else np.nan
-    best_px = float(np.percentile([disc.sigma_px for disc in discs if disc is not None], 10)) if is_ball else np.nan
-    ends = np.full((len(own), 3), [np.nan, np.nan, 0.0])
-    for frame, (candidate, patch, axis, disc) in enumerate(zip(own, patches, axes, discs, strict=True)):
-        if candidate is None:
-            continue
-        centre: Array | None = None
-        score = (candidate.area_px / whole) ** 2
-        if candidate.patch is None:
-            centre = np.array([candidate.x, candidate.y])
-        elif is_ball and disc is not None:
-            centre, score = disc.centre, (best_px / disc.sigma_px) ** 2
-        elif not is_ball and patch is not None:
-            centre = patch.centre if axis is None else patch.centre_on(axis)
-        if centre is not None:
-            unclear = axis is None and len(chosen) > 1
-            ends[frame] = *centre, _LEAST_SCORE if unclear else np.clip(score, _LEAST_SCORE, 1.0)
+    ends = np.array([(np.nan,) * 3 if disc is None else (*disc.centre, disc.sigma_px**-2) for disc in discs]).reshape(-1, 3)
+    known = np.isfinite(ends[:, 2])
+    if known.any():
+        ends[:, 2] /= np.percentile(ends[known, 2], 90)
     return ends
 
 
