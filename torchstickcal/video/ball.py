@@ -45,7 +45,7 @@ _LEAST_SIGMA_PX = 0.03
 _MOST_MISFIT = 0.25
 _MOST_SIGMA_PX = 0.6
 _MOST_HIDDEN = 0.4
-"""A stick hides less of a ball."""
+"""A stick hides less of a ball. What is larger than its disc is something else."""
 _SIZES, _LONG = 1.4, 5
 """Ratio of the radius to the usual one in so many times more frames than those that determine the radius"""
 _MOST_ASIDE = 0.7
@@ -103,7 +103,8 @@ def disc_in(patch: Patch, axis: Array | None, streak: Array, radius: tuple[float
     misfit = float(np.sqrt(np.square(rest[used]).mean()))
     aside = float(np.linalg.norm(found[:2] - seen))
     hidden = 1 - float(shares.sum() / disc.sum())
-    if sigma_px > _MOST_SIGMA_PX or misfit > _MOST_MISFIT or aside > _MOST_ASIDE * found[2] or hidden > _MOST_HIDDEN:
+    is_part = aside > _MOST_ASIDE * found[2] or not 0 <= hidden <= _MOST_HIDDEN
+    if is_part or sigma_px > _MOST_SIGMA_PX or misfit > _MOST_MISFIT:
         return None
     return Disc(found[:2], float(found[2]), sigma_px, float(np.sqrt(covariance[2, 2])), misfit)
 
