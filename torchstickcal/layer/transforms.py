@@ -60,9 +60,7 @@ def outside_graphs(function: Callable[_Arguments, _Result]) -> Callable[_Argumen
     Raises:
         CalibrationError: if it is being exported or traced: a calibration is a search whose steps depend on the numbers.
     """
-    if torch.compiler.is_exporting() or torch.jit.is_tracing():
-        if torch.compiler.is_dynamo_compiling():
-            torch._dynamo.graph_break(msg=_NO_EXPORT)
+    if (torch.compiler.is_exporting() or torch.jit.is_tracing()) and not torch.compiler.is_dynamo_compiling():
         raise CalibrationError(
             _NO_EXPORT,
             where="CalibrationLayer",
