@@ -83,7 +83,8 @@ def disc_in(patch: Patch, axis: Array | None, streak: Array, radius: tuple[float
     expected = np.array([0.0, 0.0, 0.0 if radius is None else radius[0], 1.0])
     if radius is not None:
         prior[2, 2] += (_NOISE / max(radius[1], _LEAST_SIGMA_PX)) ** 2
-    clear = ~masked
+    clear = used = ~masked
+    normal, rest, disc = prior, shares, shares
     for number in range(_ROUNDS):
         disc, slopes = _drawn(x, y, found[:2], found[2], streak)
         rest = shares - found[3] * disc
@@ -120,8 +121,10 @@ def discs_of(patches: Sequence[Patch | None], axes: Sequence[Array | None], stre
     whole = [disc if _is_usual(disc, alone, frame, _LONG * reach) else None for frame, disc in enumerate(alone)]
     found: list[Disc | None] = []
     for frame, patch in enumerate(patches):
-        usable = patch is not None and whole[frame] is not None
-        found.append(disc_in(patch, axes[frame], streaks[frame], _radius_at(whole, frame, reach)) if usable else None)
+        if patch is None or whole[frame] is None:
+            found.append(None)
+        else:
+            found.append(disc_in(patch, axes[frame], streaks[frame], _radius_at(whole, frame, reach)))
     return found
 
 
@@ -153,8 +156,8 @@ def _pixels(patch: Patch, axis: Array | None) -> tuple[Array, NDArray[np.bool_],
     """Of a marker and a margin around it, (h, w) each: shares, where another thing makes them wrong, x and y in the image."""
     shares = np.pad(patch.shares, _MARGIN_PX).astype(np.float64)
     other = np.pad(patch.other, _MARGIN_PX)
-    y, x = np.indices(shares.shape, dtype=np.float64)
-    x, y = x + patch.corner[0] - _MARGIN_PX, y + patch.corner[1] - _MARGIN_PX
+    places = np.indices(shares.shape, dtype=np.float64)
+    x, y = places[1] + (patch.corner[0] - _MARGIN_PX), places[0] + (patch.corner[1] - _MARGIN_PX)
     if axis is not None:
         unit, centre = axis / np.linalg.norm(axis), patch.centre
         across = np.abs(unit[0] * (y - centre[1]) - unit[1] * (x - centre[0]))

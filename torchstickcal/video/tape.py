@@ -295,7 +295,7 @@ def _centres(
     """The ends (F, 3) of one of the markers; ``chosen`` has the candidates of all of them."""
     own = chosen[number]
     others = [[track[frame] for k, track in enumerate(chosen) if k != number] for frame in range(len(own))]
-    axes = [None if c is None else _axis(c, *where) for c, *where in zip(own, others, hands, strict=True)]
+    axes = [None if c is None else _axis(c, seen, near) for c, seen, near in zip(own, others, hands, strict=True)]
     ends = _by_discs(own, axes) if balls else _by_symmetry(own, axes)
     unclear = np.array([axis is None for axis in axes]) & (len(chosen) > 1)
     ends[:, 2] = np.where(unclear, _LEAST_SCORE, np.clip(ends[:, 2], _LEAST_SCORE, 1.0))
