@@ -94,9 +94,11 @@ def found_in_videos(folder: Path, session: Recorded) -> Observations:
     """The keypoints that are found in the videos, as the reader takes them from the table."""
     bodies = iter(session.body)
     videos = sorted(folder.glob("*.mp4"))
-    notes = detect(videos, folder / "found", lambda: KnownBody(next(bodies)), session.markers.colours, "sports-stick-syn")
+    kind, colours = ("ball" if session.markers.balls else "tape"), session.markers.colours
+    marks = {f"{kind}s": colours}
+    notes = detect(videos, folder / "found", lambda: KnownBody(next(bodies)), skeleton="sports-stick-syn", **marks)
     print("\n".join(notes))
-    first, second = (f"tape_{colour}" for colour in session.markers.colours)
+    first, second = (f"{kind}_{colour}" for colour in colours)
     stick = Stick(first, second, session.markers.apart_m)
     fps = 1 / float(np.median(np.diff(session.times)))
     loaded = load_session(folder / "found" / "keypoints.csv", given=Given(stick, image_size=SIZE, fps=fps)).observations

@@ -254,8 +254,27 @@ class TestPhases:
         (peak,) = swing_peaks(times, motion.turn_rate[0])
         takeaway, top, impact, finish = events_of(times, motion, peak, SPORTS[sport], UP)
         assert 0 < takeaway < top < impact < finish
+        stance = {"golf": 0.25, "baseball": 0.30, "hockey": 1.05, "kendo": 0.60}[sport]
+        assert takeaway == pytest.approx(stance, abs=0.1)
         assert top == pytest.approx(key[0], abs=0.05)
         assert impact == pytest.approx(key[1], abs=0.06)
+
+    @pytest.mark.parametrize(("carried_m", "turning"), [(0.2, 0.03), (0.3, 0.2)])
+    def test_a_bat_that_is_carried_back_begins_when_it_moves(self, carried_m: float, turning: float):
+        """A bat turns slowly all the time, is carried back from 1.0 to 1.4 s, and is swung at 2 s."""
+        times = np.arange(0, 3, 1e-3)
+        share = np.clip((times - 1.0) / 0.4, 0, 1)
+        hands = carried_m * share**3 * (10 - 15 * share + 6 * share**2)
+        angle = turning * times + 1.5 * (1 + np.tanh((times - 2.2) / 0.03))
+        start = np.stack([hands, 0 * hands, 0 * hands], axis=-1)
+        tip = start + 0.86 * np.stack([np.cos(angle), 0 * angle, np.sin(angle)], axis=-1)
+        velocity = [np.gradient(part, times, axis=0)[None] for part in (start, tip)]
+        rate = np.gradient(angle, times)
+        motion = StickMotion(start[None], tip[None], *velocity, rate[None])
+        (peak,) = swing_peaks(times, rate)
+        takeaway, top, *_ = events_of(times, motion, peak, SPORTS["baseball"], UP)
+        assert 1.0 < takeaway < 1.1
+        assert 2.0 < top < 2.2
 
     def test_events_of_a_swing_that_is_cut_off_are_unknown(self):
         times, motion = true_motion("golf", 1.5)

@@ -22,6 +22,7 @@ from torchstickcal.simulate import Lens, Motion, action
 from torchstickcal.simulate.footage import CameraFilm, Exposure, Markers, markers_of, write_video
 from torchstickcal.simulate.rigs import camera_rig
 from torchstickcal.video import detect, detect_video, frames_of, video_info
+from torchstickcal.video.ball import disc_in, discs_of
 from torchstickcal.video.frames import frame_numbers
 from torchstickcal.video.patch import Patch
 from torchstickcal.video.shaft import shaft_in, shaft_track
@@ -184,9 +185,73 @@ class TestPatch:
             np.testing.assert_allclose(centre, [30, 30], atol=0.25)
 
     @pytest.mark.parametrize("turned_deg", [0.0, 120.0])
-    def test_no_centre_where_one_side_is_covered(self, turned_deg: float):
+    def test_a_side_that_is_covered_is_noticed(self, turned_deg: float):
         patch, axis = ball(4.0, turned_deg, covered=True)
-        assert patch.centre_on(axis) is None
+        assert patch.is_covered(axis)
+        assert not ball(4.0, turned_deg)[0].is_covered(axis)
+
+
+class TestBall:
+    @staticmethod
+    def seen(centre: tuple[float, float], streak: np.ndarray, hidden: np.ndarray | None = None, radius: float = 7.0) -> Patch:
+        """A ball that moves during the exposure, and where a stick or a hand hides it; colours are blurred over a pixel."""
+        y, x = np.mgrid[:60, :60].astype(float)
+        moments = (np.arange(40) + 0.5) / 40 - 0.5
+        places = [np.array(centre) + moment * streak for moment in moments]
+        shares = np.mean([np.clip(radius + 0.5 - np.hypot(x - px, y - py), 0, 1) for px, py in places], axis=0)
+        hidden = np.zeros(shares.shape, bool) if hidden is None else hidden
+        blurred = cv2.GaussianBlur(np.where(hidden, 0.0, shares), (0, 0), 0.7)
+        return Patch(np.where(blurred > 0.02, blurred, 0).astype(np.float32), hidden & (blurred < 0.3), (0, 0))
+
+    @staticmethod
+    def strip(centre: tuple[float, float], turned_deg: float, from_px: float, half_px: float) -> tuple[np.ndarray, np.ndarray]:
+        """A stick that comes out of a ball towards the camera, and its direction."""
+        y, x = np.mgrid[:60, :60].astype(float)
+        axis = np.array([np.cos(np.radians(turned_deg)), np.sin(np.radians(turned_deg))])
+        along, across = (
+            (x - centre[0]) * axis[0] + (y - centre[1]) * axis[1],
+            (y - centre[1]) * axis[0] - (x - centre[0]) * axis[1],
+        )
+        return (along > from_px) & (np.abs(across) < half_px), axis
+
+    @pytest.mark.parametrize("turned_deg", [0.0, 50.0, 200.0])
+    @pytest.mark.parametrize(("from_px", "half_px", "streak"), [(2.0, 2.0, (0, 0)), (0.0, 2.5, (0, 0)), (3.0, 2.0, (9, -4))])
+    def test_centre_behind_a_stick(self, turned_deg: float, from_px: float, half_px: float, streak: tuple[float, float]):
+        centre = (30.3, 29.6)
+        hidden, axis = self.strip(centre, turned_deg, from_px, half_px)
+        patch = self.seen(centre, np.array(streak, dtype=float), hidden)
+        assert np.linalg.norm(patch.centre - centre) > 0.4
+        disc = disc_in(patch, axis, np.array(streak, dtype=float))
+        assert disc is not None
+        np.testing.assert_allclose(disc.centre, centre, atol=0.15)
+        assert disc.radius_px == pytest.approx(7.0, abs=0.4)
+        assert disc.sigma_px > disc_in(self.seen(centre, np.array(streak)), axis, np.array(streak)).sigma_px
+
+    def test_no_disc_where_too_much_is_hidden_or_it_is_no_ball(self):
+        centre, still = (30.0, 30.0), np.zeros(2)
+        half, axis = self.strip(centre, 0.0, 0.5, 20.0)
+        assert disc_in(self.seen(centre, still, half), axis, still) is None
+        band = Patch(np.zeros((60, 60), np.float32), np.zeros((60, 60), bool), (0, 0))
+        band.shares[27:33, 10:50] = 1.0
+        assert disc_in(band, axis, still) is None
+
+    @pytest.mark.parametrize("smaller", [0.5, 1.0])
+    def test_what_is_smaller_than_usual_is_partly_hidden(self, smaller: float):
+        radii = [7.0] * 12 + [smaller * 7.0] * 3 + [7.0] * 12
+        patches = [self.seen((30.0, 30.0), np.zeros(2), radius=radius) for radius in radii]
+        discs = discs_of(patches, [np.array([1.0, 0])] * len(radii), np.zeros((len(radii), 2)), 6)
+        assert [disc is None for disc in discs] == [radius < 5 for radius in radii]
+
+    def test_balls_in_videos(self, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+        frames = [picture((30.0 + 8 * k, 60, YELLOW), (30.0 + 8 * k, 150, RED), radius=6.0, blur_px=3.0) for k in range(20)]
+        path = written(tmp_path / "a.mp4", frames, 60.0)
+        found = detect_video(path, "a", balls=["yellow", "red"])
+        assert found.points == ("ball_yellow", "ball_red")
+        assert (found.keypoints[..., 2] > 0).mean() > 0.8
+        true = np.stack([[(30.0 + 8 * k, 60), (30.0 + 8 * k, 150)] for k in range(20)])
+        assert np.nanmedian(np.linalg.norm(found.keypoints[..., :2] - true, axis=-1)) < 0.15
+        assert main(["detect", str(path), "--balls", "red", "--tape", "yellow", "--out", str(tmp_path / "out")]) == 2
+        assert "two kinds of marks" in capsys.readouterr().err
 
 
 class TestShaft:
@@ -245,6 +310,14 @@ class TestShaft:
         thing = self.frame((200.0, 60.0), EMPTY)
         cv2.rectangle(thing, (185, 30), (240, 75), (90, 60, 50), -1)  # a thing that came in hides the end
         assert np.isnan(self.found(thing, EMPTY)[:, :2]).all()
+
+    @pytest.mark.parametrize("reach_px", [16.0, 40.0])
+    def test_no_end_where_it_moves_along_the_line_during_the_exposure(self, reach_px: float):
+        middle = np.array([180.0, 70.0])
+        unit = (middle - self.HANDS) / np.linalg.norm(middle - self.HANDS)
+        moments = np.linspace(-0.5, 0.5, 30)
+        frames = [self.frame(tuple(middle + reach_px * m * unit), EMPTY).astype(float) for m in moments]
+        assert np.isnan(self.found(np.mean(frames, axis=0).astype(np.uint8), EMPTY)[:, :2]).all()
 
     def test_ends_that_jump_are_left_out(self):
         ends = [np.array([[100.0, 180.0, 0.8], [150.0 + 4 * k, 60.0, 0.8]]) for k in range(12)]

@@ -91,6 +91,7 @@ VALUES: dict[str, list[str] | None] = {
     "--up": ["0 0 1", "0 0 0", "nan 0 1", "x y z"],
     "--from": ["pose2sim", "x", ""],
     "--tape": ["red,yellow", "x", ","],
+    "--balls": ["red,yellow", "red", ",,"],
     "--shaft": None,
     "--stick-offset": ["0 0.1", "left_wrist unknown", "0 unknown", "x 1", "0 nan", "0"],
     "--weights": _PATHS,
@@ -166,7 +167,7 @@ FITTING = {
     "sample": [],
     "report": ["--rrd"],
     "analyse": ["--sport", "--up", "--fps"],
-    "detect": ["--tape", "--shaft", "--weights", "--rtmlib"],
+    "detect": ["--tape", "--balls", "--shaft", "--weights", "--rtmlib"],
 }
 """The options that a command takes, apart from those that it needs."""
 

@@ -1,6 +1,7 @@
 """Swings and their phases, from the motion of the stick alone. Each sport has rules; all of them are written in words.
 
-All rules but that of the impact use how fast the stick turns, which a walking athlete does not change.
+All rules but that of the impact, and that of the takeaway in baseball, use how fast the stick turns, which a walking athlete
+does not change.
 """
 
 from __future__ import annotations
@@ -27,8 +28,11 @@ ENDED = 0.05
 """Share of the largest turn rate of a swing at which the follow-through ends."""
 FAST_AGAIN = 0.3
 """Share of the largest turn rate by which the stick turned faster before a moment, for that moment to be between two swings."""
+BEGUN = 0.20
+"""Share of the largest turn rate, or speed, of the backswing at which it begins."""
 BACKSWING_DEG = 10.0
-"""How far the stick has turned from the top when the search for the takeaway begins."""
+"""How far the stick is turned from where it is at the top when the search for the takeaway begins. Where it is carried, its end
+is as far away."""
 STOPPED = 0.10
 """Share of the largest turn rate at which a cut has been stopped."""
 SAME_ACTION = 0.6
@@ -47,8 +51,9 @@ class Sport:
     rule: str
     impact: Search
     needs_up: bool = False
-    takeaway: float = 0.20
-    """share of the largest turn rate of the backswing at which it begins"""
+    stands: bool = False
+    """whether the athlete stands until the swing, and carries the stick back rather than turns it: the takeaway is then found
+    by the speed of the whole stick"""
 
 
 @dataclass(frozen=True, eq=False)
@@ -93,7 +98,7 @@ def _stopped(swing: _Swing) -> float:
 SPORTS: dict[str, Sport] = {
     "any": Sport("the end of the stick is fastest", _fastest),
     "golf": Sport("the club's head is nearest to where it was at the takeaway, where the ball lies", _through_address),
-    "baseball": Sport("the end of the bat is fastest", _fastest, takeaway=0.30),
+    "baseball": Sport("the end of the bat is fastest", _fastest, stands=True),
     "hockey": Sport("the blade is lowest", _lowest_point, needs_up=True),
     "kendo": Sport(f"the cut is stopped: the shinai turns at {100 * STOPPED:.0f} % of its largest rate", _stopped),
 }
@@ -102,8 +107,9 @@ SPORTS: dict[str, Sport] = {
 RULES = {
     "swing": f"around each peak of the stick's turn rate of at least {100 * SAME_ACTION:.0f} % of the largest one, if no "
     f"higher peak is within {APART_S:g} s",
-    "takeaway": "the last time before the backswing at which the stick turned at less than 20 % of the largest rate "
-    "in it (baseball, where a bat moves little before the swing: 30 %)",
+    "takeaway": f"the last time before the backswing at which the stick turned at less than {100 * BEGUN:.0f} % of the largest "
+    "rate in it; in baseball, where the bat is carried back and hardly turns: at which the bat moved at less than "
+    f"{100 * BEGUN:.0f} % of its largest speed in it, as the root mean square over the points of the bat",
     "top": f"the last time before the peak at which the stick turned at less than {100 * ONSET:.0f} % of the peak's rate; if "
     "it never did since the backswing, the moment at which it turned slowest",
     "finish": f"the first time after the peak at which the stick turns at less than {100 * ENDED:.0f} % of the peak's rate",
@@ -156,7 +162,12 @@ def events_of(times: Array, motion: StickMotion, peak: int, sport: Sport, up: Ar
     peak = int(reach[np.nanargmax(rate[reach])])
     top = _top(times, rate, peak)
     finish = _falls_below(times, rate, peak, ENDED * rate[peak])
-    takeaway = _takeaway(times, rate, motion.tip[number] - motion.start[number], top, sport.takeaway)
+    if sport.stands:
+        length_m = float(np.nanmedian(np.linalg.norm(tip - motion.start[number], axis=-1)))
+        takeaway = _takeaway(times, motion.whole_speed[number], tip / length_m, top)
+    else:
+        stick = tip - motion.start[number]
+        takeaway = _takeaway(times, rate, stick / np.linalg.norm(stick, axis=-1, keepdims=True), top)
     if sport.needs_up and up is None:
         sport = SPORTS["any"]
     if not np.isfinite([top, finish]).all():
@@ -165,18 +176,22 @@ def events_of(times: Array, motion: StickMotion, peak: int, sport: Sport, up: Ar
     return np.array([takeaway, top, impact, finish])
 
 
-def _takeaway(times: Array, rate: Array, stick: Array, top_s: float, share: float) -> float:
-    """Back from the top over the backswing, to where the stick (T, 3) turned much more slowly than since."""
+def _takeaway(times: Array, fast: Array, place: Array, top_s: float) -> float:
+    """Back from the top over the backswing, to where the stick moved much more slowly than since.
+
+    Args:
+        times: (T,). fast: how fast it turned or moved, (T,).
+        place: its direction, or the place of its end in lengths of the stick, (T, 3). top_s: time of the top.
+    """
     if not np.isfinite(top_s):
         return np.nan
     frame = int(np.searchsorted(times, top_s)) - 1
-    at_top, largest = stick[frame] / np.linalg.norm(stick[frame]), 0.0
-    cosine = (stick @ at_top) / np.linalg.norm(stick, axis=-1)
-    while frame >= 0 and times[frame] > top_s - _LONGEST_BACKSWING_S and np.isfinite(rate[frame]):
-        if largest or cosine[frame] < np.cos(np.radians(BACKSWING_DEG)):
-            largest = max(largest, rate[frame])
-        if rate[frame] < share * largest:
-            return _crossing(times, rate, frame, share * largest)
+    away, largest = np.linalg.norm(place - place[frame], axis=-1), 0.0
+    while frame >= 0 and times[frame] > top_s - _LONGEST_BACKSWING_S and np.isfinite(fast[frame]):
+        if largest or away[frame] > 2 * np.sin(np.radians(BACKSWING_DEG) / 2):
+            largest = max(largest, fast[frame])
+        if fast[frame] < BEGUN * largest:
+            return _crossing(times, fast, frame, BEGUN * largest)
         frame -= 1
     return np.nan
 

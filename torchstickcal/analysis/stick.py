@@ -34,6 +34,12 @@ class StickMotion:
         """(N, T), metres per second."""
         return np.linalg.norm(self.tip_velocity, axis=-1)
 
+    @property
+    def whole_speed(self) -> Array:
+        """(N, T), root mean square of the speeds of all points of the stick, metres per second."""
+        first, last = self.start_velocity, self.tip_velocity
+        return np.sqrt((np.square(first) + first * last + np.square(last)).sum(-1) / 3)
+
     def finer(self, times: Array, count: int) -> tuple[Array, StickMotion]:
         """Times (count * (T - 1) + 1,) and the motion at them, by cubic polynomials between the frames (T,)."""
         frames = np.arange(len(times))

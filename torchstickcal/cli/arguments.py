@@ -115,7 +115,7 @@ def _add_calibrate(commands: Any) -> None:
     command = commands.add_parser(
         "calibrate", help="calibrate a session", description="Calibrate a session: keypoints, or videos."
     )
-    _add_session(command, "a session; or one video for each camera, with --tape, --rtmlib or --weights")
+    _add_session(command, "a session; or one video for each camera, with --rtmlib or --weights, --balls, --tape or --shaft")
     _add_out(command, "results")
     _add_format(command, "SESSION")
     _add_given(command)
@@ -295,11 +295,12 @@ def _add_detectors(command: argparse.ArgumentParser) -> None:
         help="videos: use RTMLib with its own weights, which it loads when first used: lightweight, balanced or performance",
     )
     add(
-        "--tape",
+        "--balls",
         metavar="A,B",
-        help="videos: colours of tape or balls on the stick's ends, the end in the hands first: red, orange, yellow, green, "
-        "cyan, blue, magenta; the cameras must stand still",
+        help="videos: colours of two balls on the stick, that nearest to the hands first: red, orange, yellow, green, cyan, "
+        "blue, magenta; the cameras must stand still",
     )
+    add("--tape", metavar="A,B", help="videos: as --balls, for bands of tape around the stick")
     help = "videos: find a stick without marks as a line from the hands, by the body's keypoints; the cameras must stand still"
     add("--shaft", action="store_true", help=help)
 

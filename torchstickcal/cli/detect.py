@@ -30,7 +30,9 @@ def session_in(paths: Sequence[Path], options: argparse.Namespace) -> Sequence[P
     from torchstickcal.errors import CalibrationError
 
     videos = [path for path in paths if path.suffix.lower() in VIDEO_SUFFIXES and not path.is_dir()]
-    asked = [f"--{name}" for name in ("weights", "rtmlib", "tape", "shaft") if getattr(options, name) not in (None, False)]
+    asked = [
+        f"--{name}" for name in ("weights", "rtmlib", "tape", "balls", "shaft") if getattr(options, name) not in (None, False)
+    ]
     if not videos and not asked:
         return paths
     if len(videos) < len(paths):
@@ -60,12 +62,14 @@ def found_in_videos(videos: Sequence[Path], folder: Path, options: argparse.Name
         make_body = lambda: SimccModel(options.weights)  # noqa: E731
     if options.rtmlib is not None:
         make_body = lambda: RtmlibModel(options.rtmlib)  # noqa: E731
-    tapes = [name.strip().lower() for name in options.tape.split(",")] if options.tape else []
+    tapes, balls = (
+        [name.strip().lower() for name in given.split(",")] if given else [] for given in (options.tape, options.balls)
+    )
     try_writing(folder, ["keypoints.csv", "videos.json"])
     settings = {"weights": None if options.weights is None else str(options.weights), "rtmlib": options.rtmlib}
     with progress(options) as bar:
         shown = _shown(bar, [path.stem for path in videos])
-        return detect(videos, folder, make_body, tapes, options.skeleton, shown, settings, options.shaft)
+        return detect(videos, folder, make_body, tapes, options.skeleton, shown, settings, options.shaft, balls)
 
 
 def _shown(bar: Progress, cameras: list[str]) -> Callable[[str, int, int], None]:

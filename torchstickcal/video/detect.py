@@ -64,6 +64,7 @@ def detect_video(
     skeleton: str | None = None,
     progress: Progress | None = None,
     shaft: bool = False,
+    balls: Sequence[str] = (),
 ) -> VideoKeypoints:
     """Find the athlete's keypoints and the stick in a video.
 
@@ -71,12 +72,14 @@ def detect_video(
         path: of the video.
         camera: its name.
         body: finds the keypoints of the body in an image; None to look for the stick alone.
-        tapes: colours of the markers, keys of :data:`~torchstickcal.video.tape.HUES`; the first one is nearest to the hands.
-            The points are called ``tape_red`` and so on. The camera must stand still.
+        tapes: colours of the bands of tape on the stick, keys of :data:`~torchstickcal.video.tape.HUES`; the first one is
+            nearest to the hands. The points are called ``tape_red`` and so on. The camera must stand still.
         skeleton: the names of the body's points; None to know it by their number.
         progress: called after every frame.
         shaft: whether to look for a stick without marks, as a line from the hands. The points are called ``shaft_hands`` and
             ``shaft_end``. The camera must stand still.
+        balls: colours of balls on the stick, as ``tapes``, of which only one can be given. The points are called ``ball_red``
+            and so on.
 
     Raises:
         CalibrationError: if there is nothing to look for, the skeleton is not known, or a shaft is to be found without the
@@ -86,12 +89,19 @@ def detect_video(
     """
     if shaft and body is None:
         raise _no_wrists(path, "no body keypoints")
-    if body is None and not tapes:
+    if tapes and balls:
+        raise CalibrationError("two kinds of marks", where="--balls", got="--tape too", expected="one of the two")
+    marks = [*tapes, *balls]
+    if body is None and not marks:
         raise CalibrationError(
-            "nothing to look for in a video", where=str(path), got="neither weights nor tape", expected="one of them, or both"
+            "nothing to look for in a video",
+            where=str(path),
+            got="neither weights nor marks on the stick",
+            expected="one of them, or both",
+            remedy="Give --rtmlib or --weights for the body, and --balls, --tape or --shaft for the stick.",
         )
-    if tapes:
-        check_colours(tapes)
+    if marks:
+        check_colours(marks, "--balls" if balls else "--tape")
     info = video_info(path)
     times: list[float] = []
     people: list[Array] = []
@@ -104,10 +114,11 @@ def detect_video(
     names = _names(len(people[0]), skeleton) if people else ()
     numbers, fps = frame_numbers(np.array(times))
     parts = [np.stack(people)] if people else []
-    points = (*names, *(f"tape_{name}" for name in tapes))
-    if tapes or shaft:
-        background = _background(path, tapes, people, len(times))
-        parts += [ends[:, None] for ends in _tape_ends(path, background, tapes, people, names)]
+    points = (*names, *(f"{'ball' if balls else 'tape'}_{name}" for name in marks))
+    if marks or shaft:
+        background = _background(path, marks, people, len(times))
+        tracks = _mark_tracks(path, background, marks, people, names)
+        parts += [ends[:, None] for ends in ends_of(tracks, balls=bool(balls))]
         parts += [_shaft(path, background, people, names)] if shaft else []
         points += SHAFT_POINTS if shaft else ()
     return VideoKeypoints(camera, numbers, np.array(times), fps, info.size, points, np.concatenate(parts, axis=1))
@@ -122,6 +133,7 @@ def detect(
     progress: Progress | None = None,
     settings: dict[str, Any] | None = None,
     shaft: bool = False,
+    balls: Sequence[str] = (),
 ) -> list[str]:
     """Find keypoints in the videos of a rig and write the folder of a session. Videos that were done before are not read again.
 
@@ -129,7 +141,7 @@ def detect(
         paths: of the videos, one for each camera; a camera has the name of its file.
         out: the folder.
         make_body: makes a detector for each video; None for none.
-        tapes, skeleton, progress, shaft: as of :func:`detect_video`.
+        tapes, skeleton, progress, shaft, balls: as of :func:`detect_video`.
         settings: what else the results depend on; videos that were done with others are read again.
 
     Returns:
@@ -149,11 +161,13 @@ def detect(
     for path, camera in zip(paths, cameras, strict=True):
         made_of = {"file": str(path), "bytes": Path(path).stat().st_size if Path(path).is_file() else None}
         made_of |= {"tapes": list(tapes), "skeleton": skeleton, "body": make_body is not None, "shaft": shaft}
+        made_of |= {"balls": list(balls)}
         made_of |= settings or {}
         if _is_done(out, camera, made_of):
             notes.append(f"{camera}: done before.")
             continue
-        found = detect_video(path, camera, None if make_body is None else make_body(), tapes, skeleton, progress, shaft)
+        body = None if make_body is None else make_body()
+        found = detect_video(path, camera, body, tapes, skeleton, progress, shaft, balls)
         with atomic_set(out / "cameras") as folder:
             _write_table(folder / f"{camera}.csv", found)
             content = {"made_of": made_of, "fps": found.fps, "image_size": found.size, "frames": len(found.frames)}
@@ -164,24 +178,24 @@ def detect(
     return notes
 
 
-def _background(path: str | Path, tapes: Sequence[str], people: Sequence[Array], frames: int) -> Background:
+def _background(path: str | Path, marks: Sequence[str], people: Sequence[Array], frames: int) -> Background:
     chosen = sampled(frames)
-    return learned(frames_at(path, set(chosen)), tapes, [people[number] for number in chosen] if people else ())
+    return learned(frames_at(path, set(chosen)), marks, [people[number] for number in chosen] if people else ())
 
 
-def _tape_ends(
-    path: str | Path, background: Background, tapes: Sequence[str], people: Sequence[Array], names: Sequence[str]
-) -> list[Array]:
-    """The marked ends (F, 3) of each colour."""
-    if not tapes:
+def _mark_tracks(
+    path: str | Path, background: Background, marks: Sequence[str], people: Sequence[Array], names: Sequence[str]
+) -> list[TapeTrack]:
+    """What may be the marks of each colour."""
+    if not marks:
         return []
-    tracks = [TapeTrack() for _ in tapes]
+    tracks = [TapeTrack() for _ in marks]
     for frame, (_, image) in enumerate(frames_of(path)):
-        for number, (name, track) in enumerate(zip(tapes, tracks, strict=True)):
+        for number, (name, track) in enumerate(zip(marks, tracks, strict=True)):
             reach = _HAND_REACH if number == 0 else _STICK_REACH
             near = _near_hands(people[frame], names, reach) if people else None
             track.add(candidates(image, background, name, near), near)
-    return ends_of(tracks)
+    return tracks
 
 
 def _shaft(path: str | Path, background: Background, people: Sequence[Array], names: Sequence[str]) -> Array:
@@ -233,7 +247,7 @@ def _about(found: VideoKeypoints) -> str:
     text = f"{found.camera}: {len(found.frames)} frames, {found.fps:.3f} Hz"
     text += f", {dropped} dropped" if dropped else ""
     for number, name in enumerate(found.points):
-        if name.startswith(("tape_", SHAFT_POINTS[-1])):
+        if name.startswith(("tape_", "ball_", SHAFT_POINTS[-1])):
             text += f", {name} in {100 * _share_seen(found, number):.0f} %"
     return f"{text}."
 

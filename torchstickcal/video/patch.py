@@ -59,13 +59,10 @@ class Patch:
         """Centre x, y of a marker on a stick with the direction ``axis`` (2,), in the image; None where it is not sure.
 
         A ball is symmetric about its centre. Where the stick points at the camera, its near half hides a part of the ball, but
-        not what is beside the stick: along the stick, only this counts. If something else covers one end of the marker, as a
-        hand, where that end is cannot be said.
+        not what is beside the stick: along the stick, only this counts.
         """
         unit = axis / np.linalg.norm(axis)
         layout = self._layout(unit)
-        if self._is_covered(layout):
-            return None
         beside = np.where(np.abs(layout.across) > layout.hidden_px, self.shares, 0.0)
         if beside.sum() < _LEAST_BESIDE * self.shares.sum():
             return None
@@ -86,8 +83,12 @@ class Patch:
         hidden_px = 1.5 * float(np.median(touching)) + 0.75 if len(touching) else 0.0
         return _Layout(along, across, core, hidden_px, width_px)
 
-    def _is_covered(self, layout: _Layout) -> bool:
-        """Whether beside the stick another thing touches one end of the marker and not the other."""
+    def is_covered(self, axis: Array) -> bool:
+        """Whether beside a stick of direction ``axis`` (2,) another thing touches one end of the marker and not the other.
+
+        It may be a hand that covers this end: where the end is cannot be said.
+        """
+        layout = self._layout(axis / np.linalg.norm(axis))
         around = (cv2.dilate(layout.core.astype(np.uint8), np.ones((5, 5), np.uint8)) > 0) & ~layout.core
         aside = np.abs(layout.across)
         around &= (aside > max(layout.hidden_px, _OUTER * layout.width_px)) & (aside < layout.width_px + 0.5)

@@ -38,6 +38,10 @@ _LEAST_SEEN = 0.5
 _GAP_PX = 4
 _BEYOND_PX = 8
 """Length of background that must follow the end."""
+_BEFORE_PX = 40
+"""Length before the end that says how well the shaft is seen."""
+_FADED, _FADE_PX = 0.75, 5
+"""Part of the usual share below which a shaft fades, and the largest length on which it may."""
 _RIVAL = 0.6
 """Share of the pixels of the best line that makes another line a rival."""
 _ROUNDS = 3
@@ -197,7 +201,9 @@ def _end_along(scene: _Scene, line: _Line, width: int, body_px: float) -> tuple[
     covered = float(profile.thick[own[0] : end + 1].mean())
     if len(empty[beyond]) < _BEYOND_PX or not empty[beyond].all() or seen < _LEAST_SEEN or len(own) < _LEAST_LENGTH * body_px:
         return None
-    level = profile.change[own[-_BEYOND_PX:]].mean() / 2
+    level = _sharp_level(profile, own)
+    if level is None:
+        return None
     score = seen * (1 - covered) * min(1.0, 2 * level / (3 * _LEAST_CHANGE))
     return _falling_through(profile.change, end, level), float(np.clip(score, _LEAST_SCORE, 1.0))
 
@@ -225,6 +231,20 @@ def _profile(scene: _Scene, line: _Line, width: int) -> _Profile | None:
     contrast = np.abs(scene.behind[rows, columns][:, core].mean(1) - colour).max(-1)
     thick = np.asarray(scene.thick[rows, columns][:, core].any(1))
     return _Profile(shaft, thick, change[:, core].mean(1).astype(np.float64), contrast)
+
+
+def _sharp_level(profile: _Profile, own: NDArray[np.intp]) -> float | None:
+    """Half of the change from the background before the end of a shaft; None if it fades over a long way towards the end.
+
+    It fades where the end moves along the line during the exposure: only a part of the exposure sees the shaft there, and where
+    the end was in the middle of it is not known.
+    """
+    shares = profile.change / np.maximum(profile.contrast, 1.0)
+    usual = float(np.nanmedian(shares[own[-_BEFORE_PX:-_BEYOND_PX]])) if len(own) > 2 * _BEYOND_PX else np.nan
+    full = own[shares[own] > _FADED * usual]
+    if not len(full) or own[-1] - full[-1] > _FADE_PX:
+        return None
+    return 0.5 * usual * float(np.nanmedian(profile.contrast[own[-_BEYOND_PX:]]))
 
 
 def _falling_through(values: Array, end: int, level: float) -> float:

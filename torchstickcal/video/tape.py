@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from torchstickcal.errors import CalibrationError
 from torchstickcal.registry import suggestion
+from torchstickcal.video.ball import discs_of
 from torchstickcal.video.frames import Image
 from torchstickcal.video.patch import Patch
 
@@ -64,7 +65,9 @@ class Candidate:
     y: float
     area_px: float
     streak_px: float
-    """length of the streak"""
+    """length of what is seen"""
+    blur_px: float = 0.0
+    """by how much it is longer than wide"""
     patch: Patch | None = None
     """its pixels"""
 
@@ -79,13 +82,13 @@ class Background:
     """by name, blue, green, red; None where nothing of that colour moves"""
 
 
-def check_colours(names: Sequence[str]) -> None:
+def check_colours(names: Sequence[str], option: str = "--tape") -> None:
     """Raise a CalibrationError for names that are no colours, or are given twice."""
     unknown = [name for name in names if name not in HUES]
     if unknown or len(set(names)) != len(names) or not names:
         raise CalibrationError(
-            "unusable colours of tape",
-            where="--tape",
+            "unusable colours of marks",
+            where=option,
             got=",".join(names),
             expected=f"different ones of {', '.join(HUES)}",
             remedy=suggestion(unknown[0], HUES) if unknown else "",
@@ -234,7 +237,8 @@ def _markers_in(
         spread = np.cov(np.stack([columns, rows]), aweights=weights)
         width, length = np.sqrt(12 * np.maximum(np.linalg.eigvalsh(spread), 0.0)) + 1e-9
         if peak >= _PURITY * min(1.0, width / max(length - width, 1e-9)):
-            found.append(Candidate(x + corner[0], y + corner[1], area, float(length), Patch(mine, other, corner)))
+            blur = float(np.sqrt(max(length**2 - width**2, 0.0)))
+            found.append(Candidate(x + corner[0], y + corner[1], area, float(length), blur, Patch(mine, other, corner)))
     return found
 
 
@@ -264,31 +268,94 @@ class TapeTrack:
         return [c if sure else None for c, sure in zip(chosen, np.isfinite(follow[:, 0]), strict=True)]
 
 
-def ends_of(tracks: Sequence[TapeTrack]) -> list[Array]:
+def ends_of(tracks: Sequence[TapeTrack], balls: bool = False) -> list[Array]:
     """Of the marker of each track (F, 3): x and y in pixels, and a score; NaN, NaN, 0 where no end is sure.
 
-    The direction of the stick is that from one marker to the other, or from the hands to the last marker. The score is lower
-    where a marker is seen along the stick, or where that direction is not known: the stick itself may hide a part of it.
+    The direction of the stick is that from one marker to the other, or from the hands to the last marker. Balls are fitted by
+    discs, bands are centred by their symmetry. The score is lower where less of a marker is seen. It is least where the
+    direction is not known, because the stick itself may hide a part.
+
+    Args:
+        tracks: of the markers on a stick.
+        balls: whether the markers are balls.
     """
     chosen = [track.chosen() for track in tracks]
-    ends = [np.full((len(track.found), 3), [np.nan, np.nan, 0.0]) for track in tracks]
-    for number, (track, own) in enumerate(zip(tracks, chosen, strict=True)):
-        areas = [c.area_px for c in own if c is not None]
-        whole = float(np.percentile(areas, 90)) if areas else np.nan
-        for frame, candidate in enumerate(own):
-            if candidate is None:
-                continue
-            others = [c[frame] for k, c in enumerate(chosen) if k != number]
-            axis = _axis(candidate, others, track.near[frame] if number == len(tracks) - 1 else None)
-            centre: Array | None = np.array([candidate.x, candidate.y])
-            score = np.clip((candidate.area_px / whole) ** 2, _LEAST_SCORE, 1.0)
-            if candidate.patch is not None and axis is not None:
-                centre = candidate.patch.centre_on(axis)
-            elif others:
-                score = _LEAST_SCORE
-            if centre is not None:
-                ends[number][frame] = *centre, score
+    return [
+        _centres(number, chosen, track.near if number == len(tracks) - 1 else [None] * len(track.near), balls)
+        for number, track in enumerate(tracks)
+    ]
+
+
+def _centres(
+    number: int,
+    chosen: Sequence[Sequence[Candidate | None]],
+    hands: Sequence[tuple[float, float, float] | None],
+    balls: bool,
+) -> Array:
+    """The ends (F, 3) of one of the markers; ``chosen`` has the candidates of all of them."""
+    own = chosen[number]
+    others = [[track[frame] for k, track in enumerate(chosen) if k != number] for frame in range(len(own))]
+    axes = [None if c is None else _axis(c, seen, near) for c, seen, near in zip(own, others, hands, strict=True)]
+    ends = _by_discs(own, axes) if balls else _by_symmetry(own, axes)
+    unclear = np.array([axis is None for axis in axes]) & (len(chosen) > 1)
+    ends[:, 2] = np.where(unclear, _LEAST_SCORE, np.clip(ends[:, 2], _LEAST_SCORE, 1.0))
+    ends[np.isnan(ends[:, 0]), 2] = 0.0
     return ends
+
+
+def _by_symmetry(own: Sequence[Candidate | None], axes: Sequence[Array | None]) -> Array:
+    """Centres and scores (F, 3) of what is seen of a marker, along the stick of what is beside the stick."""
+    areas = np.array([np.nan if c is None else c.area_px for c in own])
+    whole = np.percentile(areas[np.isfinite(areas)], 90) if np.isfinite(areas).any() else np.nan
+    ends = np.full((len(own), 3), np.nan)
+    for frame, (candidate, axis) in enumerate(zip(own, axes, strict=True)):
+        if candidate is None:
+            continue
+        centre: Array | None = np.array([candidate.x, candidate.y])
+        if candidate.patch is not None and axis is not None:
+            centre = None if candidate.patch.is_covered(axis) else candidate.patch.centre_on(axis)
+        if centre is not None:
+            ends[frame] = *centre, (candidate.area_px / whole) ** 2
+    return ends
+
+
+def _by_discs(own: Sequence[Candidate | None], axes: Sequence[Array | None]) -> Array:
+    """Centres and scores (F, 3) of a ball: of the discs that fit its outline. The score is how well the outline determines the
+    centre, as a variance relative to the best frames."""
+    patches = [
+        None if c is None or c.patch is None or (axis is not None and c.patch.is_covered(axis)) else c.patch
+        for c, axis in zip(own, axes, strict=True)
+    ]
+    discs = discs_of(patches, axes, _streaks(own), _AREA_FRAMES)
+    ends = np.array([(np.nan,) * 3 if disc is None else (*disc.centre, disc.sigma_px**-2) for disc in discs]).reshape(-1, 3)
+    known = np.isfinite(ends[:, 2])
+    if known.any():
+        ends[:, 2] /= np.percentile(ends[known, 2], 90)
+    return ends
+
+
+def _streaks(own: Sequence[Candidate | None]) -> Array:
+    """Motion (F, 2) of a marker during the exposures, pixels: a share of the way to the neighbouring frames.
+
+    The share is the same in all frames: it is the median of those in which the marker is fast.
+    """
+    places = np.array([(c.x, c.y) if c else (np.nan, np.nan) for c in own]).reshape(-1, 2)
+    motion = np.array([_motion(places, frame) for frame in range(len(own))]).reshape(-1, 2)
+    speed = np.linalg.norm(motion, axis=-1)
+    if not speed.any():
+        return motion
+    fast = speed > 0.5 * np.percentile(speed[speed > 0], 95)
+    blur = np.array([c.blur_px if c else 0.0 for c in own])
+    return motion * float(np.clip(np.median(blur[fast] / speed[fast]), 0.0, 1.0))
+
+
+def _motion(places: Array, frame: int) -> Array:
+    """Pixels (2,) from one frame to the next, by the parabola through the places (F, 2) around a frame; 0 where not known."""
+    around = np.arange(max(0, frame - 2), min(len(places), frame + 3))
+    around = around[np.isfinite(places[around, 0])]
+    if len(around) < 2 or not np.isfinite(places[frame, 0]):
+        return np.zeros(2)
+    return np.polynomial.polynomial.polyfit(around - frame, places[around], min(2, len(around) - 1))[1]
 
 
 def _axis(candidate: Candidate, others: Sequence[Candidate | None], hands: tuple[float, float, float] | None) -> Array | None:
