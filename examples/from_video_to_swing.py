@@ -94,14 +94,15 @@ def found_in_videos(folder: Path, session: Recorded) -> Observations:
     """The keypoints that are found in the videos, as the reader takes them from the table."""
     bodies = iter(session.body)
     videos = sorted(folder.glob("*.mp4"))
-    kind, colours = ("ball" if session.markers.balls else "tape"), session.markers.colours
-    marks = {f"{kind}s": colours}
-    notes = detect(videos, folder / "found", lambda: KnownBody(next(bodies)), skeleton="sports-stick-syn", **marks)
+    colours = session.markers.colours
+    kind, tapes, balls = ("ball", (), colours) if session.markers.balls else ("tape", colours, ())
+    found = folder / "found"
+    notes = detect(videos, found, lambda: KnownBody(next(bodies)), tapes=tapes, balls=balls, skeleton="sports-stick-syn")
     print("\n".join(notes))
     first, second = (f"{kind}_{colour}" for colour in colours)
     stick = Stick(first, second, session.markers.apart_m)
     fps = 1 / float(np.median(np.diff(session.times)))
-    loaded = load_session(folder / "found" / "keypoints.csv", given=Given(stick, image_size=SIZE, fps=fps)).observations
+    loaded = load_session(found / "keypoints.csv", given=Given(stick, image_size=SIZE, fps=fps)).observations
     names = (*JOINTS, first, second)
     assert loaded.point_names is not None
     order = [loaded.point_names.index(name) for name in names]
