@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import NamedTuple
 
+import numpy as np
 import pytest
 import torch
 from torch import Tensor
@@ -13,7 +15,8 @@ from torchstickcal.losses import CameraPointLoss, FrameLoss
 from torchstickcal.model.objective import Objective
 from torchstickcal.pipeline.adjust import adjust_cameras, begin
 from torchstickcal.pipeline.run import Run
-from torchstickcal.simulate import Noise, golf_session
+from torchstickcal.simulate import Noise, SessionSpec, golf_session
+from torchstickcal.simulate.regimes import Views
 from torchstickcal.solvers.acceleration import Acceleration
 from torchstickcal.solvers.elimination.normal_equations import NormalEquations
 
@@ -84,7 +87,7 @@ def test_gradients_of_the_whole_default(tried: Case, noise: str):
     assert result.status == ("converged",)
     found = [torch.autograd.grad(value, leaves, retain_graph=True) for value in readouts(result)]
     generator = torch.Generator().manual_seed(2)
-    steps = Inputs(3e-4, 1e-4, 1e-3, 1e-2, 1e-5)  # pyright: ignore[reportArgumentType]
+    steps = Inputs(3e-4, 1e-4, 2e-4, 1e-2, 1e-5)  # pyright: ignore[reportArgumentType]
     upper = torch.tensor([[1.0, 0, 1], [0, 1, 1], [0, 0, 0]], dtype=torch.float64)
     for position, (name, value, step) in enumerate(zip(Inputs._fields, tried.inputs, steps, strict=True)):
         direction = torch.randn(value.shape, generator=generator, dtype=torch.float64) * (upper if name == "matrix" else 1)
@@ -178,6 +181,33 @@ def test_tiny_confidences_count_as_none(noise: str, tiny: float, largest: float)
     assert torch.equal(with_tiny.points, without.points)
     assert torch.equal(gradient, expected)
     assert not gradient[~half].any()
+
+
+def constant(views: Views, rng: np.random.Generator) -> Views:
+    """Each camera sees each joint, but no end of the stick, with an offset that stays."""
+    cameras, _, points, axes = views.keypoints.shape
+    offsets = 3.0 * rng.standard_normal((cameras, 1, points, axes))
+    offsets[:, :, -2:] = 0
+    return replace(views, keypoints=views.keypoints + offsets)
+
+
+def test_gradients_are_of_the_right_size_where_noise_and_minimum_do_not_agree():
+    """With strong errors that stay, the noise that is found at a minimum may lead to another one, again and again."""
+    spec = SessionSpec("golf", "golf", seed=48, cameras=4, frames=20, regimes=(Noise(1.5), constant))
+    given = spec.generate().observations
+    layer = CalibrationLayer(given.sticks)
+    generator = torch.Generator().manual_seed(0)
+    weights = torch.randn(3, 3, generator=generator, dtype=torch.float64)
+    direction = torch.randn(given.keypoints.shape, generator=generator, dtype=torch.float64)
+
+    def readout(keypoints: Tensor) -> Tensor:
+        return (layer(keypoints, given.cameras).translations[1:] * weights).sum()
+
+    keypoints = given.keypoints.clone().requires_grad_()
+    (gradient,) = torch.autograd.grad(readout(keypoints), keypoints)
+    with torch.no_grad():
+        change = float(readout(keypoints + 1e-4 * direction) - readout(keypoints - 1e-4 * direction)) / 2e-4
+    assert abs(float((gradient.nan_to_num() * direction).sum()) - change) < abs(change)
 
 
 def test_calibrate_has_the_same_bound():

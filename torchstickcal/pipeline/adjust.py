@@ -46,8 +46,9 @@ says that one of them is wrong."""
 _EXACT = 1e-5
 """Cost tolerance of the stage for this comparison."""
 _MOST_SORTED = 100_003
-_ROUGHLY = 1e-3
-"""Relative decrease of the cost from which on Newton's method can take over."""
+_ROUGHLY, _NEARLY = 1e-3, 1e-6
+"""Relative decrease of the cost from which on Newton's method can take over; and the same where it is first decided there from
+which keypoints the noise is estimated."""
 _SETTLED = 0.1
 """Relative change of the numbers of keypoints that count as one, below which a stage need not be repeated with new ones."""
 
@@ -411,7 +412,7 @@ def _with_last_camera_stage(adjustment: Adjustment, run: Run) -> Adjustment:
     *_, last = run.camera_stages.items()
     least = 0.0
     if run.settles and not adjustment.asynchronous:
-        least = _ROUGHLY
+        least = _NEARLY if last[1].reject_sigmas is None and not run.to_rounding else _ROUGHLY
     return _settled(_synchronised(through([last], adjustment, run, least), run), run)
 
 

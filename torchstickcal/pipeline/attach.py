@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 import torch
+from torch import Tensor
 
 from torchstickcal.model.measurements import Measurements
 from torchstickcal.model.state import State
@@ -21,8 +22,9 @@ from torchstickcal.solvers.newton import minimum_near
 def attach_gradients(ended: Adjustment, data: Measurements, run: Run, mode: GradientMode) -> State:
     """The state where the last stage ended, with gradients.
 
-    It depends on the measurements through the last stage that estimated cameras and through those after it. Sessions that have
-    not converged have no gradients: these are defined at a minimum only, and elsewhere may be of any size.
+    It depends on the measurements through the last stage that estimated cameras and through those after it. Where no minimum is
+    found that agrees with its own noise, the noise is held as it is. Sessions that have not converged have no gradients: these
+    are defined at a minimum only, and elsewhere may be of any size.
 
     Args:
         ended: the sessions where their last stage ended.
@@ -36,7 +38,11 @@ def attach_gradients(ended: Adjustment, data: Measurements, run: Run, mode: Grad
         held = HeldNoise(run.noise_of(result.stage), result.gates, result.inliers)
         fixed = None if result.stage.cameras == "free" else state if number else result.minimum
         levels = _levels(held, result, data, fixed if number else None)
-        state = attach(held, data, _minimum(held, data.detached(), result, fixed, levels, at_minima), mode, fixed, levels)
+        minimum, agrees = _minimum(held, data.detached(), result, fixed, levels, at_minima)
+        state = attach(held, data, minimum, mode, fixed, levels)
+        if levels is None and not bool(agrees.all()):
+            minimum, _ = _minimum(held, data.detached(), result, fixed, result.noise, at_minimum=False)
+            state = attach(held, data, minimum, mode, fixed, result.noise).replaced(agrees, state)
         if result.stage.rescale:
             kept = replace(data, confidence=data.confidence.where(result.inliers, 0.0))
             factors, _ = scale_factors(kept, state.points, rulers(kept, run.config))
@@ -69,8 +75,8 @@ def _minimum(
     fixed: State | None,
     levels: NoiseLevels | None,
     at_minimum: bool,
-) -> Linearised:
-    """A stage's minimum, to rounding: a gradient is as exact as the minimum at which it is taken.
+) -> tuple[Linearised, Tensor]:
+    """A stage's minimum, to rounding, and in which sessions it agrees with its levels: a gradient is as exact as that.
 
     Args:
         held: the noise of the stage.
@@ -82,8 +88,8 @@ def _minimum(
     """
     start = result.minimum if fixed is None else replace(fixed, points=result.minimum.points)
     if levels is None and not at_minimum:
-        return held.minimum_near(data, start)[0]
+        return held.minimum_near(data, start)
     objective = held.objective(data, result.noise if levels is None else levels)
     if at_minimum:
-        return Linearised(objective, start, cameras_free=fixed is None)
-    return minimum_near(lambda _: objective, start, cameras_free=fixed is None)[0]
+        return Linearised(objective, start, cameras_free=fixed is None), result.agrees
+    return minimum_near(lambda _: objective, start, cameras_free=fixed is None)

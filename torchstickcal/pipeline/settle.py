@@ -45,7 +45,7 @@ def settled(name: str, measurements: Measurements, result: StageResult, run: Run
     found, converged = held.minimum_near(measurements, at, run.to_rounding)
     levels = held.levels(measurements, found.state)
     run.took(name, time.perf_counter() - began)
-    return _with_minimum(result, found, run)._replace(noise=levels, gates=gates), converged
+    return _with_minimum(result, found, run)._replace(noise=levels, gates=gates, agrees=converged), converged
 
 
 @torch.no_grad()

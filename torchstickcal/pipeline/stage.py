@@ -43,6 +43,8 @@ class StageResult(NamedTuple):
     """that the losses use, as estimated where the stage began"""
     gates: NoiseGates
     """what was decided about it"""
+    agrees: Tensor
+    """(B,), whether the losses use the noise as it is found at the minimum"""
     records: tuple[StageRecord, ...]
     """one for each session"""
 
@@ -66,6 +68,7 @@ class StageResult(NamedTuple):
             inliers=self.inliers[one],
             noise=self.noise.of(one),
             gates=self.gates.of(one),
+            agrees=self.agrees[one],
             records=(self.records[session].of_one(len(self.records)),),
         )
 
@@ -79,6 +82,7 @@ class StageResult(NamedTuple):
             torch.where(where[:, None, None], other.inliers, self.inliers),
             self.noise.replaced(where, other.noise),
             self.gates.replaced(where, other.gates),
+            torch.where(where, other.agrees, self.agrees),
             tuple(new if taken else old for old, new, taken in zip(self.records, other.records, where.tolist(), strict=True)),
         )
 
@@ -145,8 +149,8 @@ def run_stage(
     records = tuple(StageRecord(name, stop, seconds, iterations) for stop, iterations in ended)
     if run.must_converge and (failed := [stop for stop in stops if not stop.converged]):
         raise CalibrationError("a stage did not converge", where=name, got=str(failed[0]), expected="convergence")
-    inliers = measurements.visible
-    return StageResult(stage, state, minimum, losses, inliers, levels, gates, records)
+    inliers, agrees = measurements.visible, torch.zeros(len(records), dtype=torch.bool, device=state.points.device)
+    return StageResult(stage, state, minimum, losses, inliers, levels, gates, agrees, records)
 
 
 def agreeing_cameras(given: Measurements, kept: Measurements) -> Tensor:

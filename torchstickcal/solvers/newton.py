@@ -22,7 +22,7 @@ _ROUNDING_SIGMAS, _NEAR_SIGMAS, _FLOAT32_SIGMAS = 1e-8, 1e-4, 1e-3
 near enough for everything but gradients, and as near as float32 allows."""
 _FAR_SIGMAS, _FAR_FROM_NEAR_SIGMAS = 1e-4, 1e-2
 """The same, above which steps that do not become shorter any more say that there is no minimum: rounding errors are smaller."""
-_REMAINING = 0.01
+_REMAINING = 0.001
 """What a step leaves, as a share of that length, below which it is the last as well: as much shorter as it was made shorter."""
 _SLOW, _OLD = 0.3, 3
 """Ratio of the lengths of two steps, and number of steps with one Hessian, from which on it is built anew."""
