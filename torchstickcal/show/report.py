@@ -90,7 +90,7 @@ def summary(calibration: Calibration) -> dict[str, Any]:
                     "end": stick.ends[1],
                     "length_m": stick.length_m,
                     "mean_m": float(lengths.nanmean()),
-                    "spread_m": float(lengths[lengths.isfinite()].std(correction=0)),
+                    "spread_m": float((lengths - lengths.nanmean()).square().nanmean().sqrt()),
                     "frames": int(lengths.isfinite().sum()),
                 }
                 for stick, lengths in zip(calibration.sticks, calibration.stick_lengths_m.mT, strict=True)
