@@ -310,7 +310,7 @@ class _CalibrationLog:
             "final/largest standard deviation [m]": float(calibration.camera_std_m.max()),
             "final/largest standard deviation [deg]": float(calibration.camera_std_deg.max()),
             "final/standard deviation of the scale": float(calibration.scale_std),
-            "final/spread of the stick's length [m]": float(lengths[lengths.isfinite()].std(correction=0))
+            "final/spread of the stick's length [m]": float((lengths - lengths.nanmean()).square().nanmean().sqrt())
             if lengths.numel()
             else 0.0,
             "final/time [s]": calibration.seconds["total"],
