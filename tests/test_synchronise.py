@@ -89,6 +89,17 @@ def test_a_camera_without_keypoints_is_undetermined():
     assert (found.offsets_frames - SPEC.fps * session.truth.time_offsets_s)[[1, 3]].abs().max() < 0.5
 
 
+@pytest.mark.parametrize("seed", range(6))
+def test_offsets_where_no_lag_fits_are_undetermined(seed: int):
+    """All points at one place, seen by three of four cameras in a few frames, with float32 keypoints."""
+    spec = SessionSpec("wand", "wand", seed=seed, cameras=4, frames=12, regimes=(Noise(3.0),), clocks=Clocks(0.02))
+    observations = spec.generate().observations
+    keypoints = observations.keypoints[:, :, :1].expand_as(observations.keypoints).clone()
+    keypoints[seed % 4] = torch.nan
+    found = search_offsets(Measurements.of(replace(observations, keypoints=keypoints), dtype=torch.float32), 6)
+    assert not any(found.determined[1:])
+
+
 def test_residuals_at_all_lags_agree_with_sampson_distances():
     """The residual at a lag is about the mean squared Sampson distance, and zero at the right lag without noise."""
     session = replace(SPEC, cameras=2, frames=40, regimes=(), clocks=Clocks()).generate()

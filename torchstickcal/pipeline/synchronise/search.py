@@ -260,7 +260,7 @@ def _reasons_for_doubt(fits: Fits, scores: Tensor, offsets: Tensor, max_offset: 
         best = int(offsets[camera]) + max_offset
         distance = (torch.arange(len(score)) - best).abs()
         rivals = score[distance > max(_MAX_PEAK_FRAMES, max_offset // 10)]
-        width = int(distance[score >= _PEAK_SHARE * score[best]].max())
+        width = int(distance.where(score >= _PEAK_SHARE * score[best], 0).max())
         if points[best] == 0:
             reasons.append("it has too few common points with the other cameras")
         elif score[best] < _MIN_SCORE * points[best]:
