@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import pytest
 import torch
+from fuzz.sessions import Spoiled, observations_of
 
 from torchstickcal import ObservationError, Observations, Stick
 from torchstickcal.model.measurements import Measurements
@@ -89,15 +90,15 @@ def test_a_camera_without_keypoints_is_undetermined():
     assert (found.offsets_frames - SPEC.fps * session.truth.time_offsets_s)[[1, 3]].abs().max() < 0.5
 
 
-@pytest.mark.parametrize("seed", range(6))
-def test_offsets_where_no_lag_fits_are_undetermined(seed: int):
-    """All points at one place, seen by three of four cameras in a few frames, with float32 keypoints."""
-    spec = SessionSpec("wand", "wand", seed=seed, cameras=4, frames=12, regimes=(Noise(3.0),), clocks=Clocks(0.02))
-    observations = spec.generate().observations
-    keypoints = observations.keypoints[:, :, :1].expand_as(observations.keypoints).clone()
-    keypoints[seed % 4] = torch.nan
-    found = search_offsets(Measurements.of(replace(observations, keypoints=keypoints), dtype=torch.float32), 6)
-    assert not any(found.determined[1:])
+def test_an_offset_at_which_nothing_fits_is_undetermined():
+    """All points are at one place, one camera sees nothing, and the best of all bad offsets has a negative score."""
+    spoils = ("all_points_the_same", "one_camera_blind")
+    session = Spoiled(
+        "wand", 4, 12, "random", noise_px=3.0, offset_s=0.02, spoils=spoils, seed=4, focal_scale=1.0, readout_s=0.0
+    )
+    observations = observations_of(session.arguments())
+    found = search_offsets(Measurements.of(observations, dtype=torch.float32), 0.1 * float(observations.fps or 30))
+    assert not found.determined[1]
 
 
 def test_residuals_at_all_lags_agree_with_sampson_distances():
