@@ -27,6 +27,7 @@ from torch.autograd import forward_ad
 from torchstickcal.arrays import tensor_of
 from torchstickcal.errors import ConfigError
 from torchstickcal.losses.robust import Quadratic, RobustKernel
+from torchstickcal.shapes import extended
 
 _LEAST_SIGMA = 1e-9
 
@@ -71,7 +72,7 @@ class Loss(nn.Module):
         """The same loss with the ``sigma`` of some sessions (B,), True where, taken from another loss."""
         if self.sigma.ndim < 3:
             return self
-        return self._with(sigma=torch.where(where.view(-1, *[1] * (self.sigma.ndim - 1)), other.sigma, self.sigma))
+        return self._with(sigma=torch.where(extended(where, self.sigma.ndim), other.sigma, self.sigma))
 
     def information(self, like: Tensor) -> Tensor:
         """1 / sigma^2 in the dtype and on the device of a tensor."""

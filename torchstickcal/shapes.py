@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
+from torch import Tensor
+
 from torchstickcal.errors import CalibrationError
 
 
@@ -40,3 +42,14 @@ def check_shapes(owner: str, arrays: Mapping[str, Any], shapes: Mapping[str, str
             expected = f"({', '.join(wanted)}{',' if len(wanted) == 1 else ''}){f' with {known}' if known else ''}"
             raise CalibrationError("an array of the wrong shape", where=f"{owner}: {name}", got=got, expected=expected)
     return sizes
+
+
+def extended(values: Tensor, ndim: int) -> Tensor:
+    """A tensor with dimensions of 1 appended, ``ndim`` dimensions in all: values per session or camera beside larger tensors.
+
+    Example:
+        >>> import torch
+        >>> extended(torch.zeros(4), 3).shape
+        torch.Size([4, 1, 1])
+    """
+    return values.reshape(*values.shape, *[1] * (ndim - values.ndim))

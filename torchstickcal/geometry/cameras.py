@@ -18,6 +18,7 @@ from torchstickcal.arrays import tensor_of
 from torchstickcal.errors import ObservationError
 from torchstickcal.lazy import cached_property
 from torchstickcal.precision import at_least_float32
+from torchstickcal.shapes import extended
 
 if TYPE_CHECKING:
     from kornia.geometry.camera import PinholeCamera
@@ -282,12 +283,12 @@ class Intrinsics:
 
     def _tilted(self, u: Tensor, v: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Distorted coordinates on a tilted sensor, and the depth by which they were divided."""
-        xx, xy, xz, yx, yy, yz, zx, zy, zz = _broadcast(self._tilt.flatten(-2).movedim(-1, 0), u.ndim + 1)
+        xx, xy, xz, yx, yy, yz, zx, zy, zz = extended(self._tilt.flatten(-2).movedim(-1, 0), u.ndim + 1)
         depth = zx * u + zy * v + zz
         return (xx * u + xy * v + xz) / depth, (yx * u + yy * v + yz) / depth, depth
 
     def _tilted_with_jacobian(self, lens: Distorted) -> Distorted:
-        xx, xy, _, yx, yy, _, zx, zy, _ = _broadcast(self._tilt.flatten(-2).movedim(-1, 0), lens.u.ndim + 1)
+        xx, xy, _, yx, yy, _, zx, zy, _ = extended(self._tilt.flatten(-2).movedim(-1, 0), lens.u.ndim + 1)
         u, v, depth = self._tilted(lens.u, lens.v)
         a, b = (xx - u * zx) / depth, (xy - u * zy) / depth
         c, d = (yx - v * zx) / depth, (yy - v * zy) / depth
@@ -325,14 +326,14 @@ class Intrinsics:
             if not bool((torch.maximum(error_u.abs(), error_v.abs()) > tolerance).any()):
                 break
         back_u, back_v = self.distort(u, v)
-        fold_radius = _broadcast(self._fold_radius, u.ndim)
+        fold_radius = extended(self._fold_radius, u.ndim)
         exact = (back_u - u_target).abs() + (back_v - v_target).abs() < max(1e-9, rounding)
         solved = exact & (u * u + v * v < fold_radius**2)
         return torch.where(solved[..., None], torch.stack([u, v], dim=-1), torch.nan)
 
     def _pixel_map(self, ndim: int) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
         """fx, skew, cx, fy, cy, each (..., C, 1, ...) for coordinates of ``ndim`` dimensions."""
-        fx, skew, cx, _, fy, cy, *_ = _broadcast(self.matrix.flatten(-2).movedim(-1, 0), ndim + 1)
+        fx, skew, cx, _, fy, cy, *_ = extended(self.matrix.flatten(-2).movedim(-1, 0), ndim + 1)
         return fx, skew, cx, fy, cy
 
     def _to_pixels(self, u: Tensor, v: Tensor) -> tuple[Tensor, Tensor]:
@@ -368,7 +369,7 @@ class Intrinsics:
         assert self.distortion is not None
         padding = 0 if self.fisheye else max(0, 8 - self.distortion.shape[-1])
         padded = torch.nn.functional.pad(self.distortion, (0, padding))
-        return list(_broadcast(padded.movedim(-1, 0), ndim + 1))
+        return list(extended(padded.movedim(-1, 0), ndim + 1))
 
     def _rational(self, u: Tensor, v: Tensor, slope: bool = True) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
         """Radial factor, its derivative by r^2 (if wanted), p1, p2 and r^2."""
@@ -428,8 +429,3 @@ def inverse_depths(depth: Tensor) -> Tensor:
 def away_from_zero(depth: Tensor) -> Tensor:
     """Depths, those nearly 0 moved to the least by which one can divide, with gradient 0."""
     return depth.abs().clamp_min(_MIN_DEPTH).copysign(depth)
-
-
-def _broadcast(per_camera: Tensor, ndim: int) -> Tensor:
-    """A tensor of values per camera with dimensions of 1 appended, ``ndim`` dimensions in all."""
-    return per_camera.reshape(*per_camera.shape, *[1] * (ndim - per_camera.ndim))

@@ -10,6 +10,7 @@ from torch import Tensor
 
 from torchstickcal.geometry import se3
 from torchstickcal.model.unknowns import Columns
+from torchstickcal.shapes import extended
 
 
 @dataclass(frozen=True)
@@ -44,7 +45,7 @@ class State:
 
     def replaced(self, where: Tensor, other: State) -> State:
         """The state with some sessions (B,), True where, taken from another."""
-        return _each(lambda mine, theirs: torch.where(where.view(-1, *[1] * (mine.ndim - 1)), theirs, mine), self, other)
+        return _each(lambda mine, theirs: torch.where(extended(where, mine.ndim), theirs, mine), self, other)
 
     def scaled(self, factors: Tensor) -> State:
         """The same scenes, each enlarged by its factor (B,)."""

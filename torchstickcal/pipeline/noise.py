@@ -22,6 +22,7 @@ from torchstickcal.model.measurements import Measurements
 from torchstickcal.model.noise import estimate_acceleration_m, sigma_px_of
 from torchstickcal.model.objective import Objective
 from torchstickcal.model.state import State
+from torchstickcal.shapes import extended
 from torchstickcal.solvers.elimination.normal_equations import NormalEquations
 from torchstickcal.solvers.linearised import Linearised
 from torchstickcal.solvers.newton import minimum_near
@@ -50,7 +51,7 @@ class NoiseLevels(NamedTuple):
     def replaced(self, where: Tensor, other: NoiseLevels) -> NoiseLevels:
         """The levels with some sessions (B,), True where, taken from another."""
         pairs = zip(self, other, strict=True)
-        return NoiseLevels(*(torch.where(where.view(-1, *[1] * (new.ndim - 1)), new, old) for old, new in pairs))
+        return NoiseLevels(*(torch.where(extended(where, new.ndim), new, old) for old, new in pairs))
 
 
 @dataclass(frozen=True)

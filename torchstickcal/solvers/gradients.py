@@ -27,6 +27,7 @@ from torchstickcal.losses import Quadratic
 from torchstickcal.model.measurements import Measurements
 from torchstickcal.model.objective import Objective
 from torchstickcal.model.state import State
+from torchstickcal.shapes import extended
 from torchstickcal.solvers.acceleration import Acceleration
 from torchstickcal.solvers.linearised import Linearised, Tangent, slope_along, tangent_gradient
 from torchstickcal.workers import on_worker
@@ -321,7 +322,7 @@ def _adjoint(minimum: Linearised, mode: GradientMode, gradient: Tangent, objecti
 
 def _where_nonzero(adjoint: Tangent, gradient: Tensor) -> Tensor:
     """A gradient (B, ...), exactly zero for sessions whose adjoint is zero: 0 times infinity may have made it NaN there."""
-    return gradient.where(adjoint.nonzero.view(-1, *[1] * (gradient.ndim - 1)), 0.0)
+    return gradient.where(extended(adjoint.nonzero, gradient.ndim), 0.0)
 
 
 def _with_data(measurements: Measurements, data: Sequence[Tensor | None]) -> Measurements:

@@ -12,6 +12,7 @@ from torchstickcal.geometry.symmetric import are_definite
 from torchstickcal.lazy import cached_property
 from torchstickcal.model.objective import Objective
 from torchstickcal.model.state import State
+from torchstickcal.shapes import extended
 from torchstickcal.solvers.elimination.evaluated import Gradient
 from torchstickcal.solvers.elimination.normal_equations import NormalEquations
 
@@ -41,7 +42,7 @@ class Tangent(NamedTuple):
 
     def where(self, kept: Tensor) -> Tangent:
         """The same for some sessions (B,), True where kept; zero for the others."""
-        return Tangent(*(part.where(kept.view(-1, *[1] * (part.ndim - 1)), 0.0) for part in self))
+        return Tangent(*(part.where(extended(kept, part.ndim), 0.0) for part in self))
 
     @property
     def nonzero(self) -> Tensor:

@@ -10,6 +10,7 @@ from torch import Tensor
 from torchstickcal.errors import ObservationError
 from torchstickcal.model.trajectories import WINDOW_FRAMES
 from torchstickcal.observations import Observations
+from torchstickcal.shapes import extended
 
 _FURTHEST_FRAME = 1e12
 _LONGEST_PAUSE_FRAMES = WINDOW_FRAMES
@@ -47,7 +48,7 @@ class CommonFrames:
         if _is_identity(self.index):
             return values
         cameras = torch.arange(len(self.index), device=self.index.device)[:, None]
-        missing = (self.index < 0).view(*self.index.shape, *[1] * (values.ndim - 2))
+        missing = extended(self.index < 0, values.ndim)
         return values[cameras, self.index.clamp_min(0)].masked_fill(missing, fill)
 
 
