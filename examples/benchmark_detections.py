@@ -242,7 +242,7 @@ def bound_with_bias(case: Case, bias: Constant) -> Bound | None:
 
     ends = [int(end) for end in case.observations.sticks[0].ends]
     along = torch.nn.functional.normalize(points[:, ends[1]] - points[:, ends[0]], dim=-1)[:, None] / 1e-5
-    stick = torch.cat([torch.stack([torch.block_diag(a, b) for a, b in zip(*(rows(by_points, e) for e in ends), strict=True)])])
+    stick = torch.stack([torch.block_diag(a, b) for a, b in zip(*(rows(by_points, end) for end in ends), strict=True)])
     stick = torch.cat([stick, torch.cat([-along, along], dim=-1)], dim=1)
     of_stick = torch.cat([rows(by_cameras, end) for end in ends], dim=1)
     of_stick = torch.nn.functional.pad(of_stick, (0, 0, 0, 1))

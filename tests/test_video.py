@@ -188,6 +188,7 @@ class TestPatch:
     def test_a_side_that_is_covered_is_noticed(self, turned_deg: float):
         patch, axis = ball(4.0, turned_deg, covered=True)
         assert patch.is_covered(axis)
+        assert patch.centre_on(axis) is None
         assert not ball(4.0, turned_deg)[0].is_covered(axis)
 
 

@@ -81,6 +81,11 @@ class ModelSelection:
         """The time offsets where the cameras' frames clearly do not belong together as given, by the motion in the images."""
         return clocks_unlike_given(*self._keypoints_and_reach) if "time_offset" in self._refinable else None
 
+    @cached_property
+    def _searched(self) -> ClockEstimate:
+        """The time offsets, by the motion in the images."""
+        return search_offsets(*self._keypoints_and_reach)
+
     def begun(self) -> Adjustment | None:
         """At the given time offsets, with the first estimate of rig and points; None where the cameras are no one rig there."""
         try:
@@ -140,7 +145,7 @@ class ModelSelection:
             except RigError as error:
                 failure = error
         if clocks is None and "time_offset" in self.allowed and not any(map(_fits, found)):
-            clocks = search_offsets(*self._keypoints_and_reach)
+            clocks = self._searched
             found += self._at_offsets(clocks)
         if not found and failure is not None:
             raise failure
@@ -156,7 +161,7 @@ class ModelSelection:
         if not adjusted.converged:
             return adjusted, check
         if "time_offset" not in adjusted.refined and check.may_be_far_in_time(self.allowed):
-            for offsets in search_offsets(*self._keypoints_and_reach).alternatives:
+            for offsets in self._searched.alternatives:
                 elsewhere = adjust_cameras(begin_at_nearest_frames(adjusted, self._run, offsets), self._run, only_last=True)
                 if (confirmed := self._confirmed(("time_offset",), self._at_nearest_frames(elsewhere), adjusted)) is not None:
                     adjusted, check = confirmed

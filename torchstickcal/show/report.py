@@ -12,6 +12,7 @@ from torchstickcal.show.look import wrapped
 from torchstickcal.show.tables import (
     camera_facts,
     camera_table,
+    length_spread_m,
     point_name,
     point_table,
     stage_table,
@@ -90,7 +91,7 @@ def summary(calibration: Calibration) -> dict[str, Any]:
                     "end": stick.ends[1],
                     "length_m": stick.length_m,
                     "mean_m": float(lengths.nanmean()),
-                    "spread_m": float((lengths - lengths.nanmean()).square().nanmean().sqrt()),
+                    "spread_m": length_spread_m(lengths),
                     "frames": int(lengths.isfinite().sum()),
                 }
                 for stick, lengths in zip(calibration.sticks, calibration.stick_lengths_m.mT, strict=True)

@@ -125,6 +125,11 @@ def stick_name(found: Calibration | Reconstruction, stick: int) -> str:
     return " - ".join(point_name(found, end) for end in found.sticks[stick].ends)
 
 
+def length_spread_m(lengths: Tensor) -> float:
+    """Standard deviation of the lengths of sticks around their mean, metres; NaN where none is known."""
+    return float((lengths - lengths.nanmean()).square().nanmean().sqrt())
+
+
 def keypoints_seen(calibration: Calibration) -> Tensor:
     """(C, F, P), True where a keypoint was given whose point is known."""
     return calibration.residuals_px.isfinite().all(-1) | calibration.inliers

@@ -29,7 +29,7 @@ from torchstickcal.show.quality import meaning_of
 from torchstickcal.show.report import table
 from torchstickcal.show.rig import rig_figure
 from torchstickcal.show.scene import mesh_view, scene_mesh
-from torchstickcal.show.tables import printable
+from torchstickcal.show.tables import length_spread_m, printable
 from torchstickcal.solvers import IterationRecord
 
 if TYPE_CHECKING:
@@ -310,9 +310,7 @@ class _CalibrationLog:
             "final/largest standard deviation [m]": float(calibration.camera_std_m.max()),
             "final/largest standard deviation [deg]": float(calibration.camera_std_deg.max()),
             "final/standard deviation of the scale": float(calibration.scale_std),
-            "final/spread of the stick's length [m]": float((lengths - lengths.nanmean()).square().nanmean().sqrt())
-            if lengths.numel()
-            else 0.0,
+            "final/spread of the stick's length [m]": length_spread_m(lengths) if lengths.numel() else 0.0,
             "final/time [s]": calibration.seconds["total"],
         }
         file = self._writer.file_writer

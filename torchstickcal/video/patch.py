@@ -28,8 +28,8 @@ class _Layout(NamedTuple):
     """(h, w), from the centre of what is seen of the marker"""
     across: Array
     """(h, w)"""
-    core: NDArray[np.bool_]
-    """(h, w), inside the marker"""
+    around: NDArray[np.bool_]
+    """(h, w), just outside the marker"""
     hidden_px: float
     """how far from the middle of the stick something hides the marker; 0 where nothing does"""
     width_px: float
@@ -59,14 +59,23 @@ class Patch:
         """Centre x, y of a marker on a stick with the direction ``axis`` (2,), in the image; None where it is not sure.
 
         A ball is symmetric about its centre. Where the stick points at the camera, its near half hides a part of the ball, but
-        not what is beside the stick: along the stick, only this counts.
+        not what is beside the stick: along the stick, only this counts. A marker that is covered has no sure centre.
         """
         unit = axis / np.linalg.norm(axis)
         layout = self._layout(unit)
+        if self._is_covered(layout):
+            return None
         beside = np.where(np.abs(layout.across) > layout.hidden_px, self.shares, 0.0)
         if beside.sum() < _LEAST_BESIDE * self.shares.sum():
             return None
         return self.centre + (beside * layout.along).sum() / beside.sum() * unit
+
+    def is_covered(self, axis: Array) -> bool:
+        """Whether beside a stick of direction ``axis`` (2,) another thing touches one end of the marker and not the other.
+
+        It may be a hand that covers this end: where the end is cannot be said.
+        """
+        return self._is_covered(self._layout(axis / np.linalg.norm(axis)))
 
     def _places(self) -> Array:
         """(2, h, w), x and y of the pixels."""
@@ -77,21 +86,15 @@ class Patch:
         along = unit[0] * offsets[0] + unit[1] * offsets[1]
         across = unit[0] * offsets[1] - unit[1] * offsets[0]
         core = self.shares > _CORE * np.percentile(self.shares[self.shares > 0], 75)
-        around = (cv2.dilate(core.astype(np.uint8), np.ones((5, 5), np.uint8)) > 0) & ~core & self.other
+        around = (cv2.dilate(core.astype(np.uint8), np.ones((5, 5), np.uint8)) > 0) & ~core
         width_px = float(np.abs(across[core]).max())
-        touching = np.abs(across[around & (np.abs(across) < width_px)])
+        touching = np.abs(across[around & self.other & (np.abs(across) < width_px)])
         hidden_px = 1.5 * float(np.median(touching)) + 0.75 if len(touching) else 0.0
-        return _Layout(along, across, core, hidden_px, width_px)
+        return _Layout(along, across, around, hidden_px, width_px)
 
-    def is_covered(self, axis: Array) -> bool:
-        """Whether beside a stick of direction ``axis`` (2,) another thing touches one end of the marker and not the other.
-
-        It may be a hand that covers this end: where the end is cannot be said.
-        """
-        layout = self._layout(axis / np.linalg.norm(axis))
-        around = (cv2.dilate(layout.core.astype(np.uint8), np.ones((5, 5), np.uint8)) > 0) & ~layout.core
+    def _is_covered(self, layout: _Layout) -> bool:
         aside = np.abs(layout.across)
-        around &= (aside > max(layout.hidden_px, _OUTER * layout.width_px)) & (aside < layout.width_px + 0.5)
+        around = layout.around & (aside > max(layout.hidden_px, _OUTER * layout.width_px)) & (aside < layout.width_px + 0.5)
         ends = [self.other[around & (sign * layout.along > 0)] for sign in (-1, 1)]
         before, after = (float(end.mean()) if len(end) else 0.0 for end in ends)
         return abs(before - after) > _COVERED

@@ -313,7 +313,7 @@ def _by_symmetry(own: Sequence[Candidate | None], axes: Sequence[Array | None]) 
             continue
         centre: Array | None = np.array([candidate.x, candidate.y])
         if candidate.patch is not None and axis is not None:
-            centre = None if candidate.patch.is_covered(axis) else candidate.patch.centre_on(axis)
+            centre = candidate.patch.centre_on(axis)
         if centre is not None:
             ends[frame] = *centre, (candidate.area_px / whole) ** 2
     return ends
