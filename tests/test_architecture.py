@@ -39,7 +39,7 @@ FLOORS = [
     ["pipeline.initialise", "pipeline.synchronise"],
     ["pipeline.relabel"],
     ["pipeline.focal_search"],
-    ["pipeline.adjust"],
+    ["pipeline.adjust", "pipeline.folds"],
     ["pipeline.check"],
     ["quality.linear"],
     ["quality.moved", "quality.acceptance"],

@@ -10,7 +10,7 @@ offsets towards zero.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from functools import lru_cache
+from functools import lru_cache, partial
 from typing import NamedTuple
 
 import torch
@@ -63,6 +63,11 @@ class LocalPolynomials(NamedTuple):
         powers = torch.arange(1, len(self.coefficients)).to(self.coefficients)[:, None, None]
         return LocalPolynomials(self.coefficients[1:] * powers, self.high_degree_motion_m).positions(delays)
 
+    def put(self, columns: Tensor, others: LocalPolynomials) -> None:
+        """Take the polynomials of some columns (k,) from others."""
+        self.coefficients[..., columns] = others.coefficients
+        self.high_degree_motion_m[columns] = others.high_degree_motion_m
+
     def interpolation_std_m(self, delays: Tensor) -> Tensor:
         """Standard deviation (C, n) of the interpolated positions along an axis, metres."""
         return _INTERPOLATION_ERROR * delays.abs() * self.high_degree_motion_m
@@ -86,52 +91,83 @@ class Trajectories:
 
     def polynomials(self, frames: slice) -> LocalPolynomials:
         """The polynomials of all points in some frames, n = frames x P columns."""
-        best, _ = self._fit(frames, _HALF_WIDTHS[0])
-        follows = torch.ones_like(best.high_degree_motion_m, dtype=torch.bool)
+        columns = torch.arange((frames.stop - frames.start) * self._points.shape[-1], device=self._points.device)
+        found = LocalPolynomials(self._points.new_empty(_DEGREES, 3, len(columns)), self._points.new_empty(len(columns)))
+        rows, narrower = columns, partial(self._fit, frames, _HALF_WIDTHS[0])
         for half_width in _HALF_WIDTHS[1:]:
-            wider, wider_follows = self._fit(frames, half_width)
-            follows &= wider_follows
-            if not bool(follows.any()):
-                break
-            best = LocalPolynomials(*(torch.where(follows, new, old) for new, old in zip(wider, best, strict=True)))
-        return best
+            fit = self._fit(frames, half_width, columns)
+            left = ~fit.follows
+            found.put(columns[left], narrower(rows[left]).shrunk)
+            rows, narrower = fit.follows.nonzero()[:, 0], fit.at
+            columns = columns[rows]
+        found.put(columns, narrower(rows).shrunk)
+        return found
 
-    def _fit(self, frames: slice, half_width: int) -> tuple[LocalPolynomials, Tensor]:
-        """Polynomials fitted to windows of one width, and whether they follow the motion in the window to within the noise."""
+    def _fit(self, frames: slice, half_width: int, columns: Tensor) -> _Fit:
+        """Weighted least squares in windows of one width, at some of the columns."""
         window = slice(frames.start + _HALF_WIDTHS[-1] - half_width, frames.stop + _HALF_WIDTHS[-1] + half_width)
-        information = self._information[window].unfold(0, 2 * half_width + 1, 1).flatten(0, 1)
-        points = self._points[:, window].unfold(1, 2 * half_width + 1, 1).flatten(1, 2).movedim(0, 1)
+        information = self._information[window].unfold(0, 2 * half_width + 1, 1).flatten(0, 1)[columns]
+        points = self._points[:, window].unfold(1, 2 * half_width + 1, 1).flatten(1, 2)[:, columns]
+        return _Fit.of(points, information, half_width)
+
+
+class _Fit(NamedTuple):
+    """Polynomials fitted to windows of one width around n columns.
+
+    The coefficients are in the basis that is orthonormal under the weights, the information over the largest in the window. So
+    the variance of the noise is 1 / largest in each.
+    """
+
+    half_width: int
+    lower: Tensor
+    """(n, K, K), Cholesky factors of the products of the basis under the weights"""
+    coefficients: Tensor
+    """(n, K, 3)"""
+    energies: Tensor
+    """(n, K), sum of the squared coefficients from each degree on"""
+    determined: Tensor
+    """(n, K), whether the window determines a degree"""
+    largest: Tensor
+    """(n, 1), largest information of a frame of the window"""
+    follows: Tensor
+    """(n,), whether the polynomial follows the motion in the window to within the noise"""
+
+    @staticmethod
+    def of(points: Tensor, information: Tensor, half_width: int) -> _Fit:
+        """Of points (3, n, w) with information (n, w) in windows of w frames."""
+        basis, products, _ = _basis(half_width, points.device)
         largest = information.amax(1, keepdim=True).clamp_min(1e-300)
         weights = information / largest
-
-        # Weighted least squares. The coefficients are in the basis that is orthonormal under the weights: the variance of the
-        # noise is 1 / largest in each. energies[k] is the sum of their squares from degree k on, noise[k] its expected value
-        # for noise alone.
-        basis, products, powers = _basis(half_width, points.device)
-        gram = (weights @ products).unflatten(1, (_DEGREES, _DEGREES)) + _RIDGE * torch.eye(_DEGREES).to(basis)
-        lower = torch.linalg.cholesky_ex(gram).L
-        weighted = (points * weights[:, None]).contiguous()  # in one matrix product instead of one for each column
-        coefficients = torch.linalg.solve_triangular(lower, (weighted @ basis).mT, upper=False)
+        gram = torch.addmm(_RIDGE * torch.eye(_DEGREES).to(basis).flatten(), weights, products)
+        lower = torch.linalg.cholesky_ex(gram.unflatten(1, (_DEGREES, _DEGREES))).L
+        weighted = points * weights
+        coefficients = torch.linalg.solve_triangular(lower, (weighted @ basis).permute(1, 2, 0), upper=False)
         determined = lower.diagonal(dim1=1, dim2=2) > _MIN_PIVOT
         coefficients = coefficients * determined[..., None]
         energies = coefficients.square().sum(2).flip(1).cumsum(1).flip(1)
-        noise = torch.arange(3 * _DEGREES, 0, -3).to(basis) / largest
-
-        # Shrink each degree by its energy and that of the higher degrees.
-        noise_limit = noise + (2 * noise / largest).sqrt()
-        shrinkage = (1 - noise_limit / energies.clamp_min(1e-300)).clamp_min(0.0)
-        shrinkage[:, :_UNSHRUNK_DEGREES] = 1.0
-        shrunk = torch.linalg.solve_triangular(lower.mT, coefficients * shrinkage[..., None], upper=True)
-        first_high = (determined.sum(1, keepdim=True) - _HIGH_DEGREES).clamp_min(_UNSHRUNK_DEGREES)
-        high_degree_motion = (energies - noise).gather(1, first_high)[:, 0].clamp_min(0.0).sqrt()
-
-        # Chi-square test of the residual.
         degrees_of_freedom = 3 * ((weights > 0).sum(1) - determined.sum(1)).clamp_min(0)
-        chi_square = ((points.square().sum(1) * weights).sum(1) - energies[:, 0]) * largest[:, 0]
+        chi_square = ((points * weighted).sum((0, 2)) - energies[:, 0]) * largest[:, 0]
         limit = degrees_of_freedom + _MAX_FIT_SIGMAS * (2 * degrees_of_freedom).sqrt()
         follows = (chi_square <= limit) & (degrees_of_freedom > 0)
-        of_powers = shrunk.permute(2, 0, 1).contiguous() @ powers.mT
-        return LocalPolynomials(of_powers.permute(2, 0, 1).contiguous(), high_degree_motion), follows
+        return _Fit(half_width, lower, coefficients, energies, determined, largest, follows)
+
+    def at(self, rows: Tensor) -> _Fit:
+        """Those of some of the n columns."""
+        return _Fit(self.half_width, *(tensor[rows] for tensor in self[1:]))
+
+    @property
+    def shrunk(self) -> LocalPolynomials:
+        """The polynomials, with each degree shrunk by its energy and that of the higher degrees."""
+        _, _, powers = _basis(self.half_width, self.lower.device)
+        noise = torch.arange(3 * _DEGREES, 0, -3).to(powers) / self.largest  # expected energy of noise alone
+        noise_limit = noise + (2 * noise / self.largest).sqrt()
+        shrinkage = (1 - noise_limit / self.energies.clamp_min(1e-300)).clamp_min(0.0)
+        shrinkage[:, :_UNSHRUNK_DEGREES] = 1.0
+        of_basis = torch.linalg.solve_triangular(self.lower.mT, self.coefficients * shrinkage[..., None], upper=True)
+        first_high = (self.determined.sum(1, keepdim=True) - _HIGH_DEGREES).clamp_min(_UNSHRUNK_DEGREES)
+        high_degree_motion = (self.energies - noise).gather(1, first_high)[:, 0].clamp_min(0.0).sqrt()
+        of_powers = of_basis.permute(2, 0, 1).contiguous() @ powers.mT
+        return LocalPolynomials(of_powers.permute(2, 0, 1), high_degree_motion)
 
 
 def _is_consistent(points: Tensor, variance: Tensor, views: Tensor) -> Tensor:

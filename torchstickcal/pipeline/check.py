@@ -24,6 +24,7 @@ from torchstickcal.model.objective import Objective
 from torchstickcal.model.state import State
 from torchstickcal.model.unknowns import RigUnknowns, all_unknowns, clock_refinements, with_refinements
 from torchstickcal.pipeline.adjust import Adjustment
+from torchstickcal.pipeline.folds import Fold, folds_of_frames, folds_of_points
 from torchstickcal.solvers import Termination, ignore_record
 from torchstickcal.solvers.elimination.normal_equations import NormalEquations
 from torchstickcal.solvers.gauss_newton import gauss_newton
@@ -55,13 +56,6 @@ class Suggestion(NamedTuple):
     """(C, n)"""
     std: Tensor
     """(C, n)"""
-
-
-class Fold(NamedTuple):
-    """A part of the keypoints: its share of the system of poses and all unknowns, without the prior."""
-
-    information: Tensor
-    gradient: Tensor
 
 
 class Solution(NamedTuple):
@@ -270,14 +264,9 @@ class CameraCheck:
     def _folds(self) -> tuple[list[Fold], list[Fold]]:
         """Parts of the keypoints: frames one after another, and groups of points."""
         objective, state = self._system.objective, self._system.state
-        m = objective.measurements
-        blocks = [frames for frames in _blocks(m.frames, _FRAME_FOLDS) if frames.stop > frames.start]
-        columns = [m.columns_of(frames) for frames in blocks]
-        of_frames = [
-            _fold(m.within(f), objective, replace(state, points=state.points[..., c]))
-            for f, c in zip(blocks, columns, strict=True)
-        ]
-        of_points = [_fold(m.keeping(kept), objective, state) for kept in _point_groups(objective)]
+        blocks = [frames for frames in _blocks(objective.measurements.frames, _FRAME_FOLDS) if frames.stop > frames.start]
+        of_frames = folds_of_frames(objective, state, blocks)
+        of_points = folds_of_points(objective, state, _point_groups(objective))
         return of_frames if len(of_frames) > 1 else [], of_points if len(of_points) > 1 else []
 
     def _solved(self, names: tuple[str, ...]) -> Solution:
@@ -319,16 +308,6 @@ def _with_every_unknown(kept: Measurements, state: State, every: RigUnknowns) ->
         unknowns=every,
         motion=kept.motion._replace(reference=every.given),
     )
-
-
-def _fold(part: Measurements, objective: Objective, state: State) -> Fold:
-    """The fold of a part of the measurements, at a state of the same columns."""
-    system = NormalEquations(Objective(part, objective.losses), state, cameras_free=True)
-    information = system.reduced[0].clone()
-    _, gradient, prior = objective.linearise_prior(state)
-    unknowns = len(information) - prior.shape[1]
-    information.diagonal()[unknowns:] -= prior[0]
-    return Fold(information, system.reduced_gradient[0] - torch.nn.functional.pad(gradient[0], (unknowns, 0)))
 
 
 def _blocks(frames: int, count: int) -> list[slice]:

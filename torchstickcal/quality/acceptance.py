@@ -16,14 +16,15 @@ import torch
 from torch import Tensor
 
 from torchstickcal.geometry.singular import solve_information
-from torchstickcal.geometry.symmetric import cholesky, expand, forward, solve
+from torchstickcal.geometry.symmetric import IDENTITY, backward, cholesky, expand, forward, solve
 from torchstickcal.losses import ReprojectionLoss
 from torchstickcal.model.measurements import Measurements
 from torchstickcal.model.objective import Objective
 from torchstickcal.model.state import State
 from torchstickcal.pipeline.adjust import Adjustment
+from torchstickcal.pipeline.folds import folds_of_frames
 from torchstickcal.quality.verdict import Acceptance, LengthErrors
-from torchstickcal.solvers.elimination.normal_equations import NormalEquations
+from torchstickcal.solvers.elimination.cross_blocks import cross_rows
 from torchstickcal.solvers.uncertainty import likelihood
 
 _FOLDS = 5
@@ -112,30 +113,29 @@ def _predicted(part: Adjustment, kept: Measurements, noise: Tensor, ruler: Tenso
     """The lengths of each stick; None without sticks among the points that take part."""
     if not len(kept.sticks) or not bool(kept.stick_active.any()):
         return None
-    shifts = _shifts_without_folds(part, kept)
     chosen = kept.sticks.flatten().unique()
     ends, state = _only(kept, part.state, chosen)
-    loss = ReprojectionLoss(part.last.sigma_px[:, None, None, chosen])
-    system = NormalEquations(Objective(ends, {"reprojection": loss}), state, cameras_free=True)
-    for _ in range(_TRIANGULATIONS):
-        held = NormalEquations(Objective(ends, {"reprojection": loss}), state, cameras_free=False)
-        state = replace(state, points=state.points + held.step().points)
-    response = ends.by_frame(system.point_response()[0])
-    points = ends.by_frame(state.points[0]).clone()
-    for frames, shift in shifts:
-        points[:, frames] += torch.einsum("k,kafp->afp", shift, response[:, :, frames])
-    lower = cholesky(system.point_hessian[0].double())
-    active = ends.by_frame(ends.active[0])
+    objective = Objective(ends, {"reprojection": ReprojectionLoss(part.last.sigma_px[:, None, None, chosen])})
+    seen = Triangulated.of(objective, state)
+    points = seen.points
+    for _ in range(_TRIANGULATIONS - 1):
+        points = Triangulated.of(objective, replace(state, points=points[None])).points
+    rows, pulled = ends.by_frame(seen.rows), torch.zeros_like(points)
+    for frames, shift in _shifts_without_folds(part, kept):
+        columns = ends.columns_of(frames)
+        pulled[:, columns] = torch.tensordot(shift, seen.rows[..., columns], 1)
+    points = points - backward(seen.lower, pulled)
+    lower, points, active = map(ends.by_frame, (seen.lower, points, ends.active[0]))
     found: list[Prediction] = []
     for number, (start, end) in enumerate(ends.sticks.tolist()):
         known = active[:, start] & active[:, end]
         along = points[..., end] - points[..., start]
         length = along.norm(dim=0)
         unit = along / length.clamp_min(1e-12)
-        half = ends.by_frame(lower)
-        keypoints = torch.stack([forward(half[..., p], unit).square().sum(0) for p in (start, end)]).sum(0)
-        by_tangent = torch.einsum("kaf,af->fk", response[..., end] - response[..., start], unit)
-        by_noise, by_ruler = (torch.einsum("fk,kl,fl->f", by_tangent, c, by_tangent).clamp_min(0.0) for c in (noise, ruler))
+        of_start, of_end = (forward(lower[..., point], unit) for point in (start, end))
+        keypoints = (of_start.square() + of_end.square()).sum(0)
+        by_tangent = torch.einsum("kaf,af->fk", rows[..., start], of_start) - torch.einsum("kaf,af->fk", rows[..., end], of_end)
+        by_noise, by_ruler = (((by_tangent @ c) * by_tangent).sum(1).clamp_min(0.0) for c in (noise, ruler))
         found.append(
             Prediction(
                 number,
@@ -149,43 +149,51 @@ def _predicted(part: Adjustment, kept: Measurements, noise: Tensor, ruler: Tenso
     return found
 
 
+class Triangulated(NamedTuple):
+    """Points by themselves, as the keypoints of one session have them near a state: to first order, for cameras as they are.
+
+    Where the cameras' tangents and unknowns are t elsewhere, a point moves by ``-L^-T W t``.
+    """
+
+    points: Tensor
+    """(3, N), metres"""
+    lower: Tensor
+    """(6, N), the Cholesky factors L of the points' information"""
+    rows: Tensor
+    """(K, 3, N), ``W^T = (L^-1 H_xc)^T``"""
+
+    @staticmethod
+    def of(objective: Objective, state: State) -> Triangulated:
+        """By an objective of reprojection alone."""
+        m = objective.measurements
+        terms = objective.linearise_chunk(state, slice(0, m.num_columns))["reprojection"]
+        known, gradient = m.active[0], terms.gradient[0].double().sum(0)
+        information = terms.hessian[0].double().sum(0).where(known, gradient.new_tensor(IDENTITY)[:, None])
+        lower = cholesky(information)
+        rows = cross_rows(terms.hessian[:, 1:].double(), state.points)[0].flatten(0, 1)
+        if terms.unknown is not None:
+            coupling = terms.unknown.coupling[0].double().flatten(2).flatten(0, 1)
+            own = m.unknowns.share.flatten(0, 1).mT @ coupling
+            rows = torch.cat([rows, own.unflatten(1, (3, -1))])
+        points = state.points[0] - backward(lower, forward(lower, gradient))
+        return Triangulated(points, lower, forward(lower, rows))
+
+
 def _shifts_without_folds(part: Adjustment, kept: Measurements) -> list[tuple[slice, Tensor]]:
     """How far the cameras' tangents and unknowns would be elsewhere without some frames, for each fold of frames."""
-    losses, state = part.last_camera_stage.losses, part.state
-    objective = likelihood(kept, losses, part.last.sigma_px)
-    system = NormalEquations(objective, state, cameras_free=True)
-    information, gradient = system.reduced[0], system.reduced_gradient[0]
-    everything = solve_information(information, gradient)
+    objective, state = likelihood(kept, part.last_camera_stage.losses, part.last.sigma_px), part.state
     bounds = [kept.frames * number // _FOLDS for number in range(_FOLDS + 1)]
     windows = [slice(start, stop) for start, stop in itertools.pairwise(bounds) if stop > start]
-    found: list[tuple[slice, Tensor]] = []
-    for _, alike in itertools.groupby(sorted(windows, key=_length), _length):
-        together = list(alike)
-        for window, own in zip(together, _shares(objective, state, together), strict=True):
-            left = solve_information(information - own[0], gradient - own[1])
-            found.append((window, everything - left))
-    return found
-
-
-def _length(window: slice) -> int:
-    return window.stop - window.start
-
-
-def _shares(objective: Objective, state: State, windows: list[slice]) -> list[tuple[Tensor, Tensor]]:
-    """What windows of equal length contribute to the reduced system and its gradient, worked out as sessions side by side.
-
-    The prior of the unknowns is no part of it: it belongs to the session.
-    """
-    kept = objective.measurements
-    points = torch.cat([state.points[..., kept.columns_of(window)] for window in windows])
-    rotations, translations = (t.expand(len(windows), *t.shape[1:]) for t in (state.rotations, state.translations))
-    own = State(rotations, translations, points, state.unknowns.expand(len(windows), -1))
-    parts = Measurements.stack([kept.within(window) for window in windows])
-    folds = NormalEquations(Objective(parts, objective.losses), own, cameras_free=True)
-    _, _, prior = folds.objective.linearise_prior(own)
-    information = folds.reduced.clone()
-    information.diagonal(dim1=1, dim2=2)[:, information.shape[1] - prior.shape[1] :] -= prior
-    return list(zip(information, folds.reduced_gradient, strict=True))
+    folds = folds_of_frames(objective, state, windows)
+    _, prior_gradient, prior = objective.linearise_prior(state)
+    poses = len(folds[0].gradient) - prior.shape[1]
+    information = torch.stack([fold.information for fold in folds]).sum(0)
+    information.diagonal()[poses:] += prior[0]
+    gradient = torch.stack([fold.gradient for fold in folds]).sum(0)
+    gradient[poses:] += prior_gradient[0]
+    everything = solve_information(information, gradient)
+    without = [solve_information(information - fold.information, gradient - fold.gradient) for fold in folds]
+    return [(window, everything - left) for window, left in zip(windows, without, strict=True)]
 
 
 def _only(kept: Measurements, state: State, points: Tensor) -> tuple[Measurements, State]:

@@ -304,9 +304,13 @@ class Evidence:
             family = all_unknowns()[unknown].family
             if not self.unknowns[unknown].refined:
                 strengths[family] = max(strengths[family], float(squared.max()))
-        if self.unsynchronised():
-            strengths["clock"] *= _SAID_BY_IMAGES
-        return strengths[name] >= max(strengths.values())
+
+        def most(clock_factor: float) -> bool:
+            weighed = strengths | {"clock": clock_factor * strengths["clock"]}
+            return weighed[name] >= max(weighed.values())
+
+        alone, said_by_images = most(1.0), most(_SAID_BY_IMAGES)
+        return alone if alone == said_by_images or not self.unsynchronised() else said_by_images
 
     @cached_property
     def acceptance(self) -> Acceptance | None:

@@ -21,10 +21,10 @@ _RIVAL_SHARE = 0.7
 def motion(evidence: Evidence) -> Iterator[Finding]:
     """The camera that moved, when and how far. A lens or a clock that is wrong looks alike, and explains more where it is."""
     found = evidence.motion
-    if found is None or not evidence.explains_most("motion"):
+    if found is None:
         return
     least = max(found.least, _LEAST_DRIFT) if found.gradual else found.least
-    if found.evidence < least:
+    if found.evidence < least or not evidence.explains_most("motion"):
         return
     name = evidence.camera(found.camera)
     like_shift_m = _like_shift_m(evidence, found)

@@ -40,7 +40,7 @@ def unknowns(evidence: Evidence) -> Iterator[Finding]:
 @findings("clocks", "cameras whose clocks are apart or uncertain, by the motion in the images")
 def clocks(evidence: Evidence) -> Iterator[Finding]:
     """Findings about clocks, of the motion in the images."""
-    if evidence.unsynchronised() and not _in_step(evidence) and frames_are_apart(evidence) is not False:
+    if not _in_step(evidence) and evidence.unsynchronised() and frames_are_apart(evidence) is not False:
         yield Finding(
             "unsynchronised",
             Severity.SERIOUS if _apart(evidence) else Severity.CAUTION,
