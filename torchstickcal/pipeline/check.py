@@ -214,10 +214,10 @@ class CameraCheck:
         folds, _ = self._folds
         if not folds:
             return 1.0
-        chosen, unknowns = self._chosen(names)
-        without = torch.stack([solve_information(*self._without(fold, chosen)) for fold in folds])[:, -unknowns.count :]
+        chosen, covariance = self._chosen(names), self._solved(names).covariance
+        without = torch.stack([solve_information(*self._without(fold, chosen)) for fold in folds])[:, -len(covariance) :]
         jackknife = (len(folds) - 1) * without.var(0, correction=0)
-        ratio = float((jackknife / self._solved(names).covariance.diagonal()).mean())
+        ratio = float((jackknife / covariance.diagonal()).mean())
         return 1.0 + _FEW_PARTS * max(0.0, ratio - 1.0)
 
     def _predicts(self, names: tuple[str, ...], values: Tensor | None = None) -> bool:
@@ -243,8 +243,7 @@ class CameraCheck:
             names: the choice.
             values: (K,), at which the cameras are.
         """
-        chosen, _ = self._chosen(names)
-        poses = self._system.poses
+        chosen, poses = self._chosen(names), self._system.poses
         information, gradient = self._without(fold, chosen)
         moved = gradient[:poses] - information[:poses, poses:] @ values
         given = torch.cat([-solve_information(information[:poses, :poses], moved), -values])
@@ -273,28 +272,46 @@ class CameraCheck:
         """A choice's unknowns, their values and their covariance."""
         if names in self._solutions:
             return self._solutions[names]
-        system, (chosen, unknowns) = self._system, self._chosen(names)
-        poses, information = system.poses, chosen.mT @ system.information @ chosen
-        values = -solve_information(information, chosen.mT @ system.gradient)[poses:]
-        covariance = covariance_of(information)
-        if system.gradient_covariance is not system.information:
-            covariance = covariance @ chosen.mT @ system.gradient_covariance @ chosen @ covariance
-        self._solutions[names] = Solution(unknowns, values, covariance[poses:, poses:])
+        (every, gradient, gradient_covariance), (picked, unknowns) = self._without_poses, self._picked(names)
+        information = picked.mT @ every @ picked
+        values, covariance = -solve_information(information, picked.mT @ gradient), covariance_of(information)
+        if gradient_covariance is not None:
+            covariance = covariance @ picked.mT @ gradient_covariance @ picked @ covariance
+        self._solutions[names] = Solution(unknowns, values, covariance)
         return self._solutions[names]
 
-    def _chosen(self, names: tuple[str, ...]) -> tuple[Tensor, RigUnknowns]:
-        """The map from poses and a choice's unknowns to poses and all unknowns, and the choice's unknowns."""
+    @cached_property
+    def _without_poses(self) -> tuple[Tensor, Tensor, Tensor | None]:
+        """The system of all unknowns from which the poses are eliminated: information, gradient, and the covariance of the
+        gradient where that is not the information."""
+        system, poses = self._system, self._system.poses
+        with_poses = system.information[poses:, :poses]
+        unknowns = torch.eye(len(with_poses)).to(with_poses)
+        map_to = torch.cat([-with_poses @ covariance_of(system.information[:poses, :poses]), unknowns], dim=1)
+        lasting = system.gradient_covariance is not system.information
+        return (
+            map_to @ system.information[:, poses:],
+            map_to @ system.gradient,
+            map_to @ system.gradient_covariance @ map_to.mT if lasting else None,
+        )
+
+    def _chosen(self, names: tuple[str, ...]) -> Tensor:
+        """The map from poses and a choice's unknowns to poses and all unknowns."""
+        picked, _ = self._picked(names)
+        return torch.block_diag(torch.eye(self._system.poses).to(picked), picked)
+
+    def _picked(self, names: tuple[str, ...]) -> tuple[Tensor, RigUnknowns]:
+        """The map from a choice's unknowns to all unknowns, and the choice's unknowns."""
         if names in self._choices:
             return self._choices[names]
         system = self._system
         unknowns = RigUnknowns.of(names, system.cameras, self._groups)
-        poses = torch.eye(system.poses).to(system.gradient)
         every = [(unknown.name, component) for unknown in system.every.unknowns for component in unknown.components]
         chosen = [(unknown.name, component) for unknown in unknowns.unknowns for component in unknown.components]
         picked = unknowns.share.new_zeros(len(unknowns.share), len(every), unknowns.count)
         picked[:, [every.index(component) for component in chosen]] = unknowns.share
         means = system.every.share / system.every.share.sum((0, 1))
-        self._choices[names] = torch.block_diag(poses, torch.einsum("cki,ckj->ij", means, picked)), unknowns
+        self._choices[names] = means.flatten(0, 1).mT @ picked.flatten(0, 1), unknowns
         return self._choices[names]
 
 

@@ -67,7 +67,7 @@ class RigUnknowns:
         priors = torch.cat(
             [cameras.matrix.new_zeros(sessions, count, 0), *(unknown.prior(cameras) for unknown, _ in chosen)], -1
         )
-        prior_sigma = torch.einsum("ckj,bck->bj", share, priors) / share.sum((0, 1))
+        prior_sigma = priors.flatten(1) @ share.flatten(0, 1) / share.sum((0, 1))
         return RigUnknowns(tuple(unknown for unknown, _ in chosen), share, prior_sigma)
 
     @staticmethod
@@ -101,7 +101,7 @@ class RigUnknowns:
 
     def by_camera(self, values: Tensor) -> Tensor:
         """Every camera's own values (B, C, k), of the rig's (B, K)."""
-        return torch.einsum("ckj,bj->bck", self.share, values)
+        return (values @ self.share.flatten(0, 1).mT).unflatten(1, self.share.shape[:2])
 
     def by_name(self, values: Tensor) -> dict[str, Tensor]:
         """Every camera's own values (B, C, n) by the name of the unknown, of the rig's (B, K)."""
@@ -109,7 +109,7 @@ class RigUnknowns:
 
     def variances(self, covariance: Tensor) -> dict[str, Tensor]:
         """Variances (C, n) of every camera's own values by the name of the unknown, of the rig's covariance (K, K)."""
-        own = torch.einsum("ckj,jl,ckl->ck", self.share, covariance, self.share)
+        own = ((self.share @ covariance) * self.share).sum(-1)
         return {unknown.name: part[0] for unknown, part in self._split(own[None])}
 
     def of_cameras(self, own: Mapping[str, Tensor]) -> Tensor:
@@ -117,7 +117,7 @@ class RigUnknowns:
         sessions, cameras = len(self.prior_sigma), len(self.share)
         zero = self.share.new_zeros(sessions, cameras, 0)
         known = [own.get(u.name, zero.new_zeros(sessions, cameras, len(u.components))) for u in self.unknowns]
-        return torch.einsum("ckj,bck->bj", self.share, torch.cat([*known, zero], dim=-1)) / self.share.sum((0, 1))
+        return torch.cat([*known, zero], dim=-1).flatten(1) @ self.share.flatten(0, 1) / self.share.sum((0, 1))
 
     def taken_over(self, others: RigUnknowns, values: Tensor) -> Tensor:
         """Values (B, K) from those (B, K') of other unknowns, as by :meth:`of_cameras`."""

@@ -96,6 +96,7 @@ class Exposures:
         """
         m = measurements
         delays = self.delays + m.unknowns.delays(self.rows, state.unknowns)
+        at_once = not bool(delays.any())
         intrinsics = m.cameras_at(state).to(torch.float64)
         pixels, velocity, confidence = m.pixels.clone(), torch.empty_like(m.pixels), m.confidence.clone()
         for session in range(m.sessions):
@@ -106,11 +107,13 @@ class Exposures:
                 polynomials, delay = trajectories.polynomials(frames), delays[session, :, columns]
                 points, velocities = polynomials.positions(delay), polynomials.velocities(delay)
                 at_exposure, inverse_depth, image_velocity = _project_moving(cameras, poses, points, velocities)
+                in_front = inverse_depth > 0
+                velocity[session, ..., columns] = image_velocity.where(in_front[:, None], 0.0).to(pixels.dtype)
+                if at_once:  # all keypoints are where they would be
+                    continue
                 x, y, z = _to_cameras(poses, polynomials.positions(torch.zeros_like(delay))).unbind(1)
                 shift = at_exposure - torch.stack(cameras.project_components(x, y, z), dim=1)
-                in_front = inverse_depth > 0
                 pixels[session, ..., columns] -= shift.where((in_front & (z > 0))[:, None], 0.0).to(pixels.dtype)
-                velocity[session, ..., columns] = image_velocity.where(in_front[:, None], 0.0).to(pixels.dtype)
                 std_px = polynomials.interpolation_std_m(delay) * cameras.focal_px[:, None] * inverse_depth
                 variance_ratio = (std_px / support.sigma_px[session].repeat(frames.stop - frames.start)).square()
                 weights = confidence[session, :, columns]
