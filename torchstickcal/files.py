@@ -34,10 +34,24 @@ _CANNOT_SYNC = {errno.EINVAL, errno.ENOTSUP, errno.ENOSYS, errno.EBADF}
 """What file systems without fsync, or without fsync of folders, answer."""
 
 
+_unfinished: set[Path] = set()
+"""The folders of this process in which sets are being written."""
+
+
 @contextmanager
 def atomic_path(path: str | Path) -> Iterator[Path]:
-    """A temporary path in the folder of ``path``. It replaces ``path`` if the block succeeds, and is deleted otherwise."""
+    """A temporary path in the folder of ``path``. It replaces ``path`` if the block succeeds, and is deleted otherwise.
+
+    A file of a set (:func:`atomic_set`) is written in its place at once: the whole set is temporary.
+    """
     path = Path(path)
+    if not _unfinished.isdisjoint(path.parents):
+        try:
+            yield path
+        except BaseException:
+            path.unlink(missing_ok=True)
+            raise
+        return
     with _temporary_folder(path.parent) as folder:
         yield folder / path.name
         _to_disk(folder / path.name)
@@ -73,14 +87,17 @@ def atomic_set(folder: str | Path) -> Iterator[Path]:
     with _created(folder), _temporary_folder(folder) as temporary:
         new, old = temporary / "new", temporary / "old"
         new.mkdir()
-        old.mkdir()
-        yield new
+        _unfinished.add(new)
+        try:
+            yield new
+        finally:
+            _unfinished.discard(new)
         names = sorted(path.relative_to(new).as_posix() for path in new.rglob("*") if not path.is_dir())
         for name in names:
             _to_disk(new / name)
         with _alone(folder):
             _exchange(folder, names, new, old)
-        shutil.rmtree(old)
+        shutil.rmtree(old, ignore_errors=True)
 
 
 def remove_remains(folder: str | Path) -> None:
@@ -144,16 +161,48 @@ def without_nan(content: Any) -> Any:
     return None if isinstance(content, float) and not math.isfinite(content) else content
 
 
-def json_text(content: Any, indent: int | None = 2) -> str:
-    """JSON that every reader accepts: null in the place of NaN and infinities. On one line without an ``indent``.
+def json_text(content: Any, indent: bool = True) -> str:
+    """JSON that every reader accepts: null in the place of NaN and infinities.
+
+    Args:
+        content: dictionaries with texts as keys, lists, texts, numbers, true, false and None.
+        indent: whether lists and dictionaries that hold others have a line for each entry; otherwise everything is on one line,
+            without spaces.
 
     Example:
-        >>> print(json_text({"mean_m": float("nan")}))
+        >>> print(json_text({"name": "left", "centre": {"x": 0.5, "y": float("nan")}}))
         {
-          "mean_m": null
+          "name": "left",
+          "centre": {"x": 0.5, "y": null}
         }
+        >>> json_text({"name": "left", "centre": {"x": 0.5, "y": float("nan")}}, indent=False)
+        '{"name":"left","centre":{"x":0.5,"y":null}}'
     """
-    return json.dumps(without_nan(content), indent=indent, allow_nan=False)
+    write = _indented if indent else _on_one_line
+    try:
+        return write(content)
+    except ValueError:  # NaN or infinity, which are rare
+        return write(without_nan(content))
+
+
+_on_one_line = json.JSONEncoder(allow_nan=False, separators=(",", ":")).encode
+_in_line = json.JSONEncoder(allow_nan=False).encode
+
+
+def _indented(content: Any, margin: str = "\n") -> str:
+    """JSON with an indentation of two spaces; ``margin`` is a line's end and what the next line begins with.
+
+    Raises:
+        ValueError: for NaN and infinities.
+    """
+    values = content.values() if isinstance(content, dict) else content if isinstance(content, list | tuple) else ()
+    if not any(isinstance(value, dict | list | tuple) for value in values):
+        return _in_line(content)
+    inner = margin + "  "
+    if isinstance(content, dict):
+        entries = [f"{inner}{_in_line(str(key))}: {_indented(value, inner)}" for key, value in content.items()]
+        return f"{{{','.join(entries)}{margin}}}"
+    return f"[{','.join(inner + _indented(value, inner) for value in content)}{margin}]"
 
 
 def write_json(path: str | Path, content: Any) -> None:
@@ -263,12 +312,13 @@ def _exchange(folder: Path, names: list[str], new: Path, old: Path) -> None:
     moves: list[tuple[Path, Path]] = []
     try:
         for source, target in ((folder, old), (new, folder)):
-            for name in names:
-                if os.path.lexists(source / name):
-                    (target / name).parent.mkdir(parents=True, exist_ok=True)
-                    moves.append((source / name, target / name))
-                    (source / name).rename(target / name)
-            _to_disk(folder)
+            own = [name for name in names if os.path.lexists(source / name)]
+            for name in own:
+                (target / name).parent.mkdir(parents=True, exist_ok=True)
+                moves.append((source / name, target / name))
+                (source / name).rename(target / name)
+            if own:
+                _to_disk(folder)
     except BaseException:
         for source, target in reversed(moves):
             if os.path.lexists(target) and not os.path.lexists(source):

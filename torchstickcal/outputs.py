@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from torchstickcal.errors import CalibrationError
 from torchstickcal.files import PAGE_FILE, POINTS_FILE, REPORT_FILE, RERUN_FILE, atomic_path, write_json
+from torchstickcal.io.about import version_of
 from torchstickcal.io.writers import CALIBRATION_WRITERS, Writer, writer_of
 from torchstickcal.show.rerun import rerun_package, write_rerun
 
@@ -154,7 +155,6 @@ def write_page(path: Path, calibration: Calibration, made_of: dict[str, Any]) ->
 def versions() -> dict[str, str]:
     """The versions of what calculates."""
     import platform
-    from importlib.metadata import version
 
     packages = ("torchstickcal", "torch", "kornia", "numpy")
-    return {name: version(name) for name in packages} | {"python": platform.python_version()}
+    return {name: version_of(name) for name in packages} | {"python": platform.python_version()}

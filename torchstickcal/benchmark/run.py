@@ -123,7 +123,7 @@ def run_benchmark(
         for done, row in enumerate(_measured(place, missing, jobs, prepare), len(wanted) - len(missing) + 1):
             if row is not None:
                 known[row.case, row.method] = row
-                stream.write(json_text(asdict(row), indent=None) + "\n")
+                stream.write(json_text(asdict(row), indent=False) + "\n")
                 stream.flush()
             if progress:
                 progress(done, len(wanted), f"{row.case} {row.method}" if row else "skipped: no truth")

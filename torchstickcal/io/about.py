@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from datetime import UTC, datetime
+from functools import cache
 from importlib.metadata import version
 
 from torchstickcal.world import World
@@ -12,9 +13,15 @@ _DATE = "SOURCE_DATE_EPOCH"
 """The environment variable, common to many programs, that holds the date of what is written, in seconds since 1970."""
 
 
+@cache
+def version_of(package: str) -> str:
+    """The version of a package, looked up once."""
+    return version(package)
+
+
 def generator() -> str:
     """The program and its version."""
-    return f"torchstickcal {version('torchstickcal')}"
+    return f"torchstickcal {version_of('torchstickcal')}"
 
 
 def date() -> str | None:

@@ -91,7 +91,7 @@ class Manifest:
 
     def append(self, rows: Sequence[SessionRow]) -> None:
         """Write rows, whole, to the disk."""
-        _write_whole(self._descriptor, "".join(json_text(asdict(row), indent=None) + "\n" for row in rows).encode())
+        _write_whole(self._descriptor, "".join(json_text(asdict(row), indent=False) + "\n" for row in rows).encode())
 
 
 @contextmanager

@@ -42,7 +42,7 @@ def write_tables(folder: Path) -> None:
         rows = sorted(read_manifests(folder).values(), key=lambda row: natural_order(row.name))
         with atomic_set(folder) as new:
             (new / CSV_FILE).write_text(as_csv(rows), "utf-8", newline="")
-            (new / LINES_FILE).write_text("".join(json_text(asdict(row), indent=None) + "\n" for row in rows), "utf-8")
+            (new / LINES_FILE).write_text("".join(json_text(asdict(row), indent=False) + "\n" for row in rows), "utf-8")
             (new / INDEX_FILE).write_text(page(rows, folder), "utf-8")
         if _sizes(folder) == before:
             return

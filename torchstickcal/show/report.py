@@ -115,17 +115,15 @@ def summary(calibration: Calibration) -> dict[str, Any]:
 
 def _parameter_summary(calibration: Calibration, parameter: CameraParameter) -> dict[str, Any]:
     """One unknown of the cameras as JSON can hold it."""
-    tensors = ("value", "std", "given", "suggested", "suggested_std")
+    names = ("value", "std", "given", "suggested", "suggested_std")
+    tensors = {name: parameter.by_component(name).tolist() for name in names}
     return {
         "label": parameter.label,
         "unit": parameter.unit,
         "refined": parameter.refined,
         "cameras": [
             {"name": name}
-            | {
-                tensor: dict(zip(parameter.components, parameter.by_component(tensor)[camera].tolist(), strict=True))
-                for tensor in tensors
-            }
+            | {tensor: dict(zip(parameter.components, rows[camera], strict=True)) for tensor, rows in tensors.items()}
             for camera, name in enumerate(calibration.camera_names)
         ],
     }

@@ -112,6 +112,8 @@ def printable(text: str) -> str:
         >>> print(printable("left\ncamera"))
         left\ncamera
     """
+    if text.isprintable():
+        return text
     return "".join(letter if letter.isprintable() else letter.encode("unicode_escape").decode() for letter in text)
 
 
@@ -225,15 +227,18 @@ def _unknown_table(calibration: Calibration, parameter: CameraParameter) -> Tabl
             ),
         ]
 
-    def of(camera: int, number: int, name: str, std: str | None) -> str:
-        value = float(parameter.by_component(name)[camera, number])
-        return with_std(
-            factor * value, float("nan") if std is None else factor * float(parameter.by_component(std)[camera, number])
-        )
-
+    names = ("given", "value", "std", "suggested", "suggested_std")
+    values = {name: (factor * parameter.by_component(name)).tolist() for name in names}
     pairs = (("given", None), ("value", "std"), ("suggested", "suggested_std"))
     rows = tuple(
-        (label, *(of(camera, number, *pair) for number in range(len(parameter.components)) for pair in pairs))
+        (
+            label,
+            *(
+                with_std(values[name][camera][number], values[std][camera][number] if std else float("nan"))
+                for number in range(len(parameter.components))
+                for name, std in pairs
+            ),
+        )
         for camera, label in enumerate(calibration.camera_names)
     )
     return Table(parameter.label.capitalize(), tuple(columns), rows)

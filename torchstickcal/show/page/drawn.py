@@ -81,15 +81,25 @@ class Drawing:
         found[index < 0] = missing
         return found
 
-    def projections(self, frames: Tensor) -> Tensor:
-        """Where the points of some common frames appear in all images, (C, n, P, 2), pixels."""
+    def projections(self, frames: Tensor, cameras: slice = slice(None)) -> Tensor:
+        """Where the points of some common frames appear in all images, or those of some cameras, (C, n, P, 2), pixels."""
         c = self.calibration
         lens = None if c.distortion is None else c.distortion.double().cpu()
-        cameras = Intrinsics(c.intrinsics.double().cpu(), lens, c.fisheye)
+        own = Intrinsics(c.intrinsics.double().cpu(), lens, c.fisheye)[cameras]
         points = c.points[frames.to(c.points.device)].detach().double().cpu()
-        turned = torch.einsum("cij,npj->cnpi", c.rotations.double().cpu(), points)
-        in_camera = turned + c.translations.double().cpu()[:, None, None]
-        return cameras.project(in_camera).where(in_camera[..., 2:] > 0, torch.nan)
+        in_camera = points.flatten(0, 1) @ c.rotations[cameras].double().cpu().mT + c.translations[cameras].double().cpu()[:, None]
+        return own.project(in_camera).where(in_camera[..., 2:] > 0, torch.nan).unflatten(1, points.shape[:2])
+
+    @cached_property
+    def corners(self) -> Tensor:
+        """(C, 5, 3), the pyramid of each camera."""
+        return frusta(self.calibration).detach().cpu()
+
+    @cached_property
+    def ellipsoids(self) -> Tensor:
+        """(C, 3, 3), half axes of the ellipsoids that hold 95 % of the cameras' positions."""
+        c = self.calibration
+        return _half_axes(centre_covariances(c.camera_centres.double(), c.covariance).cpu())
 
     @cached_property
     def image_sizes(self) -> list[list[float]]:
@@ -135,7 +145,7 @@ def _scene(drawing: Drawing) -> dict[str, Any]:
     """Points, bones and sticks in space, around the middle of the scene."""
     c, frames = drawing.calibration, drawing.frames
     points = c.points.detach().double().cpu()[frames]
-    corners = frusta(c).detach().cpu().flatten(0, 1)
+    corners = drawing.corners.flatten(0, 1)
     known = points[points.isfinite().all(-1)]
     scene = corners
     if len(known):
@@ -198,14 +208,11 @@ def _half_axes(covariances: Tensor) -> Tensor:
 
 def _camera(drawing: Drawing, camera: int) -> dict[str, Any]:
     """One camera: its pyramid, its ellipsoid, and its image with coverage and residuals."""
-    c = drawing.calibration
-    corners = frusta(c)[camera].detach().cpu()
-    centres = c.camera_centres.double()
-    axes = _half_axes(centre_covariances(centres, c.covariance)[camera].cpu())
+    axes = drawing.ellipsoids[camera]
     width, height = drawing.image_sizes[camera]
     return {
-        "name": c.camera_names[camera],
-        "corners": corners.tolist(),
+        "name": drawing.calibration.camera_names[camera],
+        "corners": drawing.corners[camera].tolist(),
         "ellipsoid": axes.tolist() if bool(axes.isfinite().all()) and bool((axes != 0).any()) else None,
         "width": width,
         "height": height,
@@ -221,7 +228,7 @@ def _image_statistics(drawing: Drawing, camera: int, width: float, height: float
     own = own[:: 1 + len(own) * c.points.shape[1] // _CELL_KEYPOINTS]
     residuals = c.residuals_px[camera].detach().double().cpu()[own]
     used = c.inliers[camera].cpu()[own]
-    places = drawing.projections(index[own])[camera] - residuals
+    places = drawing.projections(index[own], slice(camera, camera + 1))[0] - residuals
     found = used & places.isfinite().all(-1)
     places, sizes = places[found], residuals[found]
     columns = _CELLS if width >= height else max(1, round(_CELLS * width / height))

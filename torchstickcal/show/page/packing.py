@@ -28,11 +28,11 @@ def packed(values: Tensor, largest: float | None = None) -> dict[str, Any]:
         >>> packed(torch.tensor([1.0, float("nan")]))
         {'factor': 3.125e-05, 'int16': 'AH0AgA=='}
     """
-    numbers = values.detach().double().cpu()
-    known = numbers.isfinite() if largest is None else numbers.abs() <= largest
-    most = float(numbers[known].abs().max()) if bool(known.any()) else 1.0
+    numbers = values.detach().double().cpu().numpy()
+    known = np.isfinite(numbers) if largest is None else np.abs(numbers) <= largest
+    most = float(np.abs(numbers[known]).max(initial=0.0))
     factor = (most or 1.0) / _LARGEST
-    integers = (numbers / factor).round().where(known, UNKNOWN).numpy().astype("<i2")
+    integers = np.where(known, np.rint(numbers / factor), UNKNOWN).astype("<i2")
     return {"factor": factor, "int16": _base64(integers)}
 
 

@@ -4,17 +4,16 @@ from __future__ import annotations
 
 import base64
 import hashlib
-import json
 import math
 import statistics
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from functools import cache
 from html import escape
 from importlib.resources import files
 from pathlib import PurePath
 from typing import Any
 
-from torchstickcal.files import without_nan
+from torchstickcal.files import json_text
 from torchstickcal.quality.finding import Finding, Severity
 from torchstickcal.quality.verdict import Acceptance, LengthErrors, Quality
 from torchstickcal.result import Calibration
@@ -70,7 +69,7 @@ def report_page(calibration: Calibration, provenance: Mapping[str, Any] | None =
     script = "(() => {\n'use strict';\n" + "".join(map(_asset, _SCRIPTS)) + "})();\n"
     seal = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
     policy = f"default-src 'none'; script-src 'sha256-{seal}'; style-src 'unsafe-inline'; img-src data:; base-uri 'none'"
-    content = json.dumps(without_nan(data), allow_nan=False, separators=(",", ":")).replace("<", "\\u003c")
+    content = json_text(data, indent=False).replace("<", "\\u003c")
     body = "".join(
         [
             _head(calibration, title),
@@ -280,7 +279,8 @@ def _cameras(calibration: Calibration, data: Mapping[str, Any], facts: Sequence[
         f"<label><input type='radio' name='mode' value='{value}'{' checked' if value == 'frame' else ''}>{text}</label>"
         for value, text in (("frame", "this frame"), ("residuals", "mean residuals"))
     )
-    cards = "".join(_card(calibration, data, camera, own) for camera, own in enumerate(facts))
+    checks = _checks(calibration)
+    cards = "".join(_card(calibration, data, camera, own, checks[camera]) for camera, own in enumerate(facts))
     return (
         f'<section id="cameras"><h2>Cameras</h2><div class="controls segmented" role="group" aria-label="Images show">{modes}'
         "<label><input type='checkbox' id='enlarge'> enlarge the part with keypoints</label></div>"
@@ -299,7 +299,9 @@ def _cameras(calibration: Calibration, data: Mapping[str, Any], facts: Sequence[
     )
 
 
-def _card(calibration: Calibration, data: Mapping[str, Any], camera: int, own: CameraFacts) -> str:
+def _card(
+    calibration: Calibration, data: Mapping[str, Any], camera: int, own: CameraFacts, checks: Sequence[tuple[str, str]]
+) -> str:
     """One camera: its image, its residuals, and what is known of it."""
     image = data["cameras"][camera]
     place = f"± {digits(1000 * own.std_m)} mm, ± {digits(own.std_deg)} deg"
@@ -308,7 +310,7 @@ def _card(calibration: Calibration, data: Mapping[str, Any], camera: int, own: C
         ("Image covered", share(image["covered"])),
         ("Reprojection", f"{digits(own.median_px)} px median, {digits(own.rms_px)} px rms"),
         ("Position, rotation", "the reference" if camera == 0 and own.std_m == 0 else place),
-        *_checks(calibration, camera),
+        *checks,
     ]
     other = int(calibration.other_person[camera].sum())
     if other:
@@ -324,23 +326,27 @@ def _card(calibration: Calibration, data: Mapping[str, Any], camera: int, own: C
     )
 
 
-def _checks(calibration: Calibration, camera: int) -> Iterable[tuple[str, str]]:
-    """Focal length and clock: what was given or estimated, and what the keypoints suggest."""
+def _checks(calibration: Calibration) -> list[list[tuple[str, str]]]:
+    """Focal length and clock of each camera: what was given or estimated, and what the keypoints suggest."""
+    found: list[list[tuple[str, str]]] = [[] for _ in calibration.camera_names]
     for name, title in _CHECKED.items():
         parameter = calibration.unknowns.get(name)
         if parameter is None:
             continue
         factor, unit = (1000, "ms") if parameter.unit == "s" else (1, parameter.unit)
-        value, std, given, suggested, suggested_std = (
-            factor * float(parameter.by_component(which)[camera, 0])
-            for which in ("value", "std", "given", "suggested", "suggested_std")
-        )
-        if parameter.refined:
-            yield title, f"{with_std(value, std)} {unit} estimated, {with_std(given, math.nan)} given"
-        elif math.isfinite(suggested) and not (camera == 0 and name == "time_offset"):
-            yield title, f"{with_std(given, math.nan)} {unit} given, {with_std(suggested, suggested_std)} suggested"
-        elif math.isfinite(given):
-            yield title, f"{with_std(given, math.nan)} {unit} given"
+        tensors = ("value", "std", "given", "suggested", "suggested_std")
+        rows = zip(*((factor * parameter.by_component(which)[:, 0]).tolist() for which in tensors), strict=True)
+        for camera, (value, std, given, suggested, suggested_std) in enumerate(rows):
+            if parameter.refined:
+                said = f"{with_std(value, std)} {unit} estimated, {with_std(given, math.nan)} given"
+            elif math.isfinite(suggested) and not (camera == 0 and name == "time_offset"):
+                said = f"{with_std(given, math.nan)} {unit} given, {with_std(suggested, suggested_std)} suggested"
+            elif math.isfinite(given):
+                said = f"{with_std(given, math.nan)} {unit} given"
+            else:
+                continue
+            found[camera].append((title, said))
+    return found
 
 
 def _tags(calibration: Calibration, name: str) -> str:
@@ -417,7 +423,7 @@ def _made_of(provenance: Mapping[str, Any]) -> str:
 
 def _value(value: Any) -> str:
     if isinstance(value, dict) and any(isinstance(part, (dict, list)) for part in value.values()):
-        return f"<details><summary>show</summary><pre>{escape(json.dumps(without_nan(value), indent=1))}</pre></details>"
+        return f"<details><summary>show</summary><pre>{escape(json_text(value))}</pre></details>"
     if isinstance(value, dict):
         return ", ".join(f"{escape(printable(str(name)))} {escape(printable(str(part)))}" for name, part in value.items())
     if isinstance(value, list):
