@@ -301,13 +301,13 @@ class Calibration:
         variances = self.covariance.diagonal().unflatten(0, (-1, 6))[:, 3:].sum(1)
         return torch.nn.functional.pad(variances.sqrt().rad2deg(), (1, 0)).to(self.rotations.dtype)
 
-    @property
+    @cached_property
     def camera_std_m(self) -> Tensor:
         """(C,), standard deviation of each camera's centre from its true position relative to the first camera, metres."""
         covariances = centre_covariances(self.camera_centres.double(), self.covariance)
         return covariances.diagonal(dim1=1, dim2=2).sum(1).sqrt().to(self.rotations.dtype)
 
-    @property
+    @cached_property
     def scale_std(self) -> Tensor:
         """(), standard deviation of the rig's scale, as a fraction of it."""
         return relative_scale_std(self.camera_centres.double(), self.covariance).to(self.rotations.dtype)
@@ -358,12 +358,12 @@ class Calibration:
         found = self._point_covariances(flat, visible, sigma)
         return found.diagonal(dim1=1, dim2=2).sqrt().to(points.dtype).view(points.shape)
 
-    @property
+    @cached_property
     def reprojection_rms_px(self) -> Tensor:
         """(C,), root mean square over the inliers of each camera of the residuals' lengths, pixels."""
         return self._inlier_distances().square().nanmean(1).sqrt()
 
-    @property
+    @cached_property
     def reprojection_median_px(self) -> Tensor:
         """(C,), median over the inliers of each camera of the residuals' lengths, pixels."""
         return self._inlier_distances().nanmedian(1).values

@@ -13,6 +13,7 @@ from torchstickcal.geometry import se3
 from torchstickcal.lazy import cached_property
 from torchstickcal.model.correlation import error_correlation
 from torchstickcal.model.measurements import Measurements
+from torchstickcal.model.ranks import nanquantile
 from torchstickcal.model.state import State
 from torchstickcal.model.unknowns import all_unknowns
 from torchstickcal.observations import Observations
@@ -172,14 +173,16 @@ class Evidence:
         of the principal point, or many far outside. So they do where the intrinsics are those of another resolution."""
         observations = self.observations
         centre = observations.cameras.matrix[:, :2, 2].double()
-        found = torch.zeros(self.cameras, dtype=torch.bool, device=centre.device)
-        for camera in range(self.cameras if observations.intrinsics_known else 0):
-            seen = observations.keypoints[camera][observations.visible[camera]].double()
-            if len(seen):
-                places = seen[:: 1 + len(seen) // _MOST_PLACES] / centre[camera] - 1
-                low, high = places.quantile(places.new_tensor(_MOST_SHARE), dim=0)
-                outside = observations.image_size is None and bool((low.abs().maximum(high.abs()) > _OUTSIDE).any())
-                found[camera] = bool((high < 0).all()) or outside
+        if not observations.intrinsics_known:
+            return torch.zeros(self.cameras, dtype=torch.bool, device=centre.device)
+        thinned = slice(None, None, 1 + observations.keypoints[0, ..., 0].numel() // _MOST_PLACES)
+        keypoints, visible = observations.keypoints[:, thinned], observations.visible[:, thinned, :, None]
+        places = (keypoints.double() / centre[:, None, None] - 1).where(visible, torch.nan).flatten(1, 2).mT
+        low_share, high_share = _MOST_SHARE
+        high = nanquantile(places, high_share)
+        found = (high < 0).all(1)
+        if observations.image_size is None:
+            found |= (nanquantile(places, low_share).abs().maximum(high.abs()) > _OUTSIDE).any(1)
         return found
 
     @cached_property

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import itertools
+import math
 from collections.abc import Iterator
 
 import torch
@@ -63,8 +63,8 @@ def _shares(evidence: Evidence) -> Iterator[Finding]:
     """Cameras of whose keypoints too few agree with those of the other cameras."""
     unknown = ~evidence.ended.agreeing_cameras[0]
     median = float(evidence.agreement.median())
-    for camera, share in enumerate(evidence.agreement.tolist()):
-        own, left = (int(m.visible[0, camera].sum()) for m in (evidence.measurements, evidence.kept))
+    counts = [m.visible[0].sum(-1).tolist() for m in (evidence.measurements, evidence.kept)]
+    for camera, (share, own, left) in enumerate(zip(evidence.agreement.tolist(), *counts, strict=True)):
         name = evidence.camera(camera)
         common = {"cameras": (name,), "figure": share, "unit": "share"}
         if bool(unknown[camera]):
@@ -111,14 +111,13 @@ def _shares(evidence: Evidence) -> Iterator[Finding]:
 
 def _same_views(evidence: Evidence) -> Iterator[Finding]:
     """Pairs of cameras that see the points from the same place, and rigs that have no baseline at all."""
-    measurements = evidence.measurements
+    visible = evidence.measurements.visible[0]
     rays = torch.nn.functional.normalize(evidence.state.points - evidence.centres[..., None], dim=1)
     angles: dict[tuple[int, int], float] = {}
-    for first, second in itertools.combinations(range(evidence.cameras), 2):
-        common = measurements.visible[0, first] & measurements.visible[0, second]
-        if bool(common.any()):
-            apart = (rays[first] - rays[second])[:, common].square().sum(0).sqrt()
-            angles[first, second] = float(apart.median())
+    for first in range(evidence.cameras - 1):
+        apart = (rays[first] - rays[first + 1 :]).square().sum(1).where(visible[first] & visible[first + 1 :], torch.nan)
+        medians = apart.nanmedian(1).values.sqrt().tolist()
+        angles |= {(first, second): angle for second, angle in enumerate(medians, first + 1) if not math.isnan(angle)}
     same = {pair: angle for pair, angle in angles.items() if angle < _SAME_VIEW_RAD}
     for (first, second), angle in same.items():
         names = (evidence.camera(first), evidence.camera(second))

@@ -143,7 +143,7 @@ def _step(frames: Tensor) -> int:
 
 def _scene(drawing: Drawing) -> dict[str, Any]:
     """Points, bones and sticks in space, around the middle of the scene."""
-    c, frames = drawing.calibration, drawing.frames
+    c, frames, axes = drawing.calibration, drawing.frames, plot_rotation(drawing.calibration)
     points = c.points.detach().double().cpu()[frames]
     corners = drawing.corners.flatten(0, 1)
     known = points[points.isfinite().all(-1)]
@@ -151,9 +151,9 @@ def _scene(drawing: Drawing) -> dict[str, Any]:
     if len(known):
         inner = torch.quantile(known[:: 1 + len(known) // 100_000], torch.tensor([0.02, 0.98]).double(), dim=0)
         scene = torch.cat([corners, inner])
-        low = float((known[:: 1 + len(known) // 100_000] @ plot_rotation(c)[2]).quantile(0.01))
+        low = float((known[:: 1 + len(known) // 100_000] @ axes[2]).quantile(0.01))
     else:
-        low = float((corners @ plot_rotation(c)[2]).min())
+        low = float((corners @ axes[2]).min())
     middle = (scene.amax(0) + scene.amin(0)) / 2
     radius = float((scene - middle).norm(dim=1).max()) or 1.0
     around = points - middle
@@ -163,8 +163,8 @@ def _scene(drawing: Drawing) -> dict[str, Any]:
     return {
         "middle": middle.tolist(),
         "radius": radius,
-        "axes": plot_rotation(c).tolist(),
-        "floor": low - float(middle @ plot_rotation(c)[2]),
+        "axes": axes.tolist(),
+        "floor": low - float(middle @ axes[2]),
         "points": packed(around),
         "names": [point_name(c, index) for index in range(points.shape[1])],
         "bones": bones_of(c.point_names),
