@@ -122,9 +122,21 @@ class CameraCheck:
 
     def suggestion(self, name: str) -> Suggestion:
         """What the keypoints suggest for an unknown by itself, by its name."""
-        unknowns, values, covariance = self._solved((self._variants[name],))
-        deviation, variance = unknowns.by_name(values[None])[name][0], unknowns.variances(covariance)[name]
-        return Suggestion(deviation, variance.sqrt())
+        return self._suggestions[name]
+
+    @cached_property
+    def _suggestions(self) -> dict[str, Suggestion]:
+        """For each unknown, as if there were no other: by the blocks on the diagonal of the system of all."""
+        every, (information, gradient, gradient_covariance) = self._system.every, self._without_poses
+        block = torch.cat([torch.full_like(columns, number) for number, columns in enumerate(every.columns.values())])
+        alone = information.where(block == block[:, None], 0.0)
+        values, covariance = -solve_information(alone, gradient), covariance_of(alone)
+        if gradient_covariance is not None:
+            covariance = covariance @ gradient_covariance @ covariance
+        variances = every.variances(covariance)
+        return {
+            name: Suggestion(deviation[0], variances[name].sqrt()) for name, deviation in every.by_name(values[None]).items()
+        }
 
     def wanted(
         self, allowed: Collection[str], refined: Sequence[str] = (), failed: Sequence[tuple[str, ...]] = ()
@@ -289,11 +301,8 @@ class CameraCheck:
         unknowns = torch.eye(len(with_poses)).to(with_poses)
         map_to = torch.cat([-with_poses @ covariance_of(system.information[:poses, :poses]), unknowns], dim=1)
         lasting = system.gradient_covariance is not system.information
-        return (
-            map_to @ system.information[:, poses:],
-            map_to @ system.gradient,
-            map_to @ system.gradient_covariance @ map_to.mT if lasting else None,
-        )
+        gradient_covariance = map_to @ system.gradient_covariance @ map_to.mT if lasting else None
+        return map_to @ system.information[:, poses:], map_to @ system.gradient, gradient_covariance
 
     def _chosen(self, names: tuple[str, ...]) -> Tensor:
         """The map from poses and a choice's unknowns to poses and all unknowns."""

@@ -105,7 +105,10 @@ class Exposures:
             cameras, poses = intrinsics[session], (state.rotations[session], state.translations[session])
             for columns, frames in zip(m.chunks(), m.frame_slices(), strict=True):
                 polynomials, delay = trajectories.polynomials(frames), delays[session, :, columns]
-                points, velocities = polynomials.positions(delay), polynomials.velocities(delay)
+                if at_once:
+                    points, velocities = polynomials.coefficients[:2]
+                else:
+                    points, velocities = polynomials.positions(delay), polynomials.velocities(delay)
                 at_exposure, inverse_depth, image_velocity = _project_moving(cameras, poses, points, velocities)
                 in_front = inverse_depth > 0
                 velocity[session, ..., columns] = image_velocity.where(in_front[:, None], 0.0).to(pixels.dtype)
@@ -132,8 +135,8 @@ def _project_moving(
     Args:
         cameras: C cameras.
         poses: rotations (C, 3, 3) and translations (C, 3), world to camera.
-        points: each camera's own points in the world, (C, 3, n), metres.
-        velocities: (C, 3, n), metres per frame.
+        points: each camera's own points in the world, (C, 3, n), or those of all, (3, n), metres.
+        velocities: likewise, metres per frame.
 
     Returns:
         Pixels (C, 2, n), inverse depths (C, n), and velocities in the image (C, 2, n), pixels per frame.
@@ -147,6 +150,6 @@ def _project_moving(
 
 
 def _to_cameras(poses: tuple[Tensor, Tensor], points: Tensor) -> Tensor:
-    """Each camera's own points (C, 3, n), from the world to the camera."""
+    """Each camera's own points (C, 3, n), or those of all (3, n), from the world to the camera: (C, 3, n)."""
     rotations, translations = poses
     return rotations @ points + translations[..., None]
