@@ -22,8 +22,9 @@ import numpy as np
 import pytest
 import torch
 
-from torchstickcal import Calibration, CalibrationError, FileFormatError, calibrate
-from torchstickcal.files import atomic_set, json_text, try_writing
+from torchstickcal import Calibration, CalibrationError, FileFormatError, calibrate, files
+from torchstickcal.archives import save_arrays
+from torchstickcal.files import atomic_path, atomic_set, json_text, try_writing
 from torchstickcal.io import (
     Rig,
     Truth,
@@ -379,6 +380,40 @@ def test_a_set_that_fails_changes_nothing(tmp_path: Path, monkeypatch: pytest.Mo
     assert not (tmp_path / "new").exists()
 
 
+def test_a_file_of_a_set_is_whole_or_not_there(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """Also where the block goes on after an error; and every file of the set is put on the disk once."""
+    synced: list[str] = []
+    monkeypatch.setattr(files, "_to_disk", lambda path: synced.append(path.name))
+    with atomic_set(tmp_path / "set") as folder:
+        (folder / "inner").mkdir()
+        for name in ("a", "inner/b"):
+            with suppress(ZeroDivisionError), atomic_path(folder / name) as path:
+                path.write_text("half")
+                _ = 1 / 0
+            assert not (folder / name).exists()
+            with atomic_path(folder / name) as path:
+                path.write_text("whole")
+    assert sorted(synced) == ["a", "b", "set"]
+    assert contents(tmp_path / "set") | contents(tmp_path / "set" / "inner") == {"a": "whole", "b": "whole"}
+    assert len(list((tmp_path / "set").iterdir())) == 2, "nothing else is left"
+
+
+def test_digits_are_stored_as_they_are_and_patterns_compressed(tmp_path: Path):
+    digits, rng = {}, np.random.default_rng(0)
+    digits["float64"], digits["float32"] = rng.standard_normal(5000), rng.standard_normal((50, 100)).astype(np.float32)
+    patterns = {"numbers": np.arange(5000), "flags": np.ones((10, 500), dtype=bool), "gaps": np.full(5000, np.nan)}
+    small = {"text": np.array("a"), "nothing": np.zeros((0, 3)), "scalar": np.array(1.0)}
+    with (tmp_path / "a.npz").open("wb") as file:
+        save_arrays(file, digits | patterns | small)
+    with zipfile.ZipFile(tmp_path / "a.npz") as archive:
+        sizes = {member.filename.removesuffix(".npy"): (member.compress_size, member.file_size) for member in archive.filelist}
+    assert all(sizes[name][0] == sizes[name][1] for name in digits)
+    assert all(sizes[name][0] < 0.5 * sizes[name][1] for name in patterns)
+    with np.load(tmp_path / "a.npz") as found:
+        for name, array in (digits | patterns | small).items():
+            np.testing.assert_array_equal(found[name], array)
+
+
 def test_a_folder_is_tried_without_a_trace(tmp_path: Path):
     (tmp_path / "file").touch()
     (tmp_path / "taken" / "points.npz").mkdir(parents=True)
@@ -392,5 +427,25 @@ def test_a_folder_is_tried_without_a_trace(tmp_path: Path):
 
 def test_json_has_no_nan():
     content = {"a": float("nan"), "b": [float("inf"), 1.0, ("x", -float("inf"))], "c": "NaN"}
-    found = json.loads(json_text(content), parse_constant=lambda name: pytest.fail(name))
-    assert found == {"a": None, "b": [None, 1.0, ["x", None]], "c": "NaN"}
+    for indent in (True, False):
+        found = json.loads(json_text(content, indent), parse_constant=lambda name: pytest.fail(name))
+        assert found == {"a": None, "b": [None, 1.0, ["x", None]], "c": "NaN"}
+
+
+def test_json_has_lines_for_what_holds_more():
+    content = {"a": [1.5, "x\n", None, True], "b": [{"c": {}, "d": []}, {"\u00e9": 2}], "e": {}}
+    text = json_text(content)
+    assert json.loads(text) == content == json.loads(json_text(content, indent=False))
+    assert text.splitlines() == [
+        "{",
+        '  "a": [1.5, "x\\n", null, true],',
+        '  "b": [',
+        "    {",
+        '      "c": {},',
+        '      "d": []',
+        "    },",
+        '    {"\\u00e9": 2}',
+        "  ],",
+        '  "e": {}',
+        "}",
+    ]

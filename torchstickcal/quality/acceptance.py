@@ -24,6 +24,7 @@ from torchstickcal.model.state import State
 from torchstickcal.pipeline.adjust import Adjustment
 from torchstickcal.pipeline.folds import folds_of_frames
 from torchstickcal.quality.verdict import Acceptance, LengthErrors
+from torchstickcal.shapes import extended
 from torchstickcal.solvers.elimination.cross_blocks import cross_rows
 from torchstickcal.solvers.uncertainty import likelihood
 
@@ -120,12 +121,9 @@ def _predicted(part: Adjustment, kept: Measurements, noise: Tensor, ruler: Tenso
     points = seen.points
     for _ in range(_TRIANGULATIONS - 1):
         points = Triangulated.of(objective, replace(state, points=points[None])).points
-    rows, pulled = ends.by_frame(seen.rows), torch.zeros_like(points)
-    for frames, shift in _shifts_without_folds(part, kept):
-        columns = ends.columns_of(frames)
-        pulled[:, columns] = torch.tensordot(shift, seen.rows[..., columns], 1)
-    points = points - backward(seen.lower, pulled)
-    lower, points, active = map(ends.by_frame, (seen.lower, points, ends.active[0]))
+    tangents = _shifts_without_folds(part, kept).repeat_interleave(len(chosen), 0)
+    points = points + seen.moved(tangents.mT[:, None])
+    lower, rows, points, active = map(ends.by_frame, (seen.lower, seen.rows, points, ends.active[0]))
     found: list[Prediction] = []
     for number, (start, end) in enumerate(ends.sticks.tolist()):
         known = active[:, start] & active[:, end]
@@ -150,10 +148,7 @@ def _predicted(part: Adjustment, kept: Measurements, noise: Tensor, ruler: Tenso
 
 
 class Triangulated(NamedTuple):
-    """Points by themselves, as the keypoints of one session have them near a state: to first order, for cameras as they are.
-
-    Where the cameras' tangents and unknowns are t elsewhere, a point moves by ``-L^-T W t``.
-    """
+    """Points by themselves, as the keypoints of one session have them near a state: to first order, for cameras as they are."""
 
     points: Tensor
     """(3, N), metres"""
@@ -178,9 +173,17 @@ class Triangulated(NamedTuple):
         points = state.points[0] - backward(lower, forward(lower, gradient))
         return Triangulated(points, lower, forward(lower, rows))
 
+    def moved(self, tangents: Tensor) -> Tensor:
+        """How far the points move (3, N) where the cameras' tangents and unknowns are elsewhere: ``-L^-T W t``.
 
-def _shifts_without_folds(part: Adjustment, kept: Measurements) -> list[tuple[slice, Tensor]]:
-    """How far the cameras' tangents and unknowns would be elsewhere without some frames, for each fold of frames."""
+        Args:
+            tangents: (K,), or for each point its own, (K, 1, N).
+        """
+        return -backward(self.lower, (self.rows * extended(tangents, 3)).sum(0))
+
+
+def _shifts_without_folds(part: Adjustment, kept: Measurements) -> Tensor:
+    """How far the cameras' tangents and unknowns would be elsewhere without the fold that each frame is in, (F, K)."""
     objective, state = likelihood(kept, part.last_camera_stage.losses, part.last.sigma_px), part.state
     bounds = [kept.frames * number // _FOLDS for number in range(_FOLDS + 1)]
     windows = [slice(start, stop) for start, stop in itertools.pairwise(bounds) if stop > start]
@@ -193,7 +196,8 @@ def _shifts_without_folds(part: Adjustment, kept: Measurements) -> list[tuple[sl
     gradient[poses:] += prior_gradient[0]
     everything = solve_information(information, gradient)
     without = [solve_information(information - fold.information, gradient - fold.gradient) for fold in folds]
-    return [(window, everything - left) for window, left in zip(windows, without, strict=True)]
+    lengths = torch.tensor([window.stop - window.start for window in windows], device=everything.device)
+    return (everything - torch.stack(without)).repeat_interleave(lengths, 0)
 
 
 def _only(kept: Measurements, state: State, points: Tensor) -> tuple[Measurements, State]:

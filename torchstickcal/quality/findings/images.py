@@ -114,7 +114,8 @@ def _same_video(evidence: Evidence) -> Iterator[Finding]:
                 yield Finding(
                     "same_video",
                     Severity.FATAL if evidence.cameras == 2 else Severity.SERIOUS,
-                    f"{names[0]} and {names[1]} have the same keypoints within {distance:.2g} px: one video was taken for both.",
+                    f"{names[0]} and {names[1]} have the same keypoints within {distance:.2g} px: one video was taken for "
+                    "both.",
                     "Give each camera its own video.",
                     cameras=names,
                     figure=distance,

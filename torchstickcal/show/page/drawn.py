@@ -87,7 +87,9 @@ class Drawing:
         lens = None if c.distortion is None else c.distortion.double().cpu()
         own = Intrinsics(c.intrinsics.double().cpu(), lens, c.fisheye)[cameras]
         points = c.points[frames.to(c.points.device)].detach().double().cpu()
-        in_camera = points.flatten(0, 1) @ c.rotations[cameras].double().cpu().mT + c.translations[cameras].double().cpu()[:, None]
+        in_camera = (
+            points.flatten(0, 1) @ c.rotations[cameras].double().cpu().mT + c.translations[cameras].double().cpu()[:, None]
+        )
         return own.project(in_camera).where(in_camera[..., 2:] > 0, torch.nan).unflatten(1, points.shape[:2])
 
     @cached_property
