@@ -149,7 +149,7 @@ def test_keypoints_on_one_clock_stay_where_they_are(evidence: Evidence):
 def test_clocks_count_twice_where_images_speak_against_them_too(name: str):
     family = {"lens": "focal", "clock": "time_offset"}
     for strengths in ([9.0, 4.0, 5.0], [9.0, 4.0, 3.0], [4.0, 9.0, 5.0], [4.0, 5.0, 9.0], [8.0, 8.0, 4.0], [0.0, 0.0, 0.0]):
-        given = dict(zip(("motion", "lens", "clock"), strengths, strict=True))
+        given: dict[str, float] = dict(zip(("motion", "lens", "clock"), strengths, strict=True))
         for apart in (True, False):
             stub = SimpleNamespace(
                 motion=SimpleNamespace(evidence=given["motion"]),

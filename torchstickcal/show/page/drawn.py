@@ -6,7 +6,9 @@ import math
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from torchstickcal.geometry.cameras import Intrinsics
@@ -28,6 +30,8 @@ _CELLS = 16
 """Cells along the longer side of an image."""
 _CELL_KEYPOINTS = 200_000
 """Keypoints of a camera from which the cells are filled."""
+_LEAST_OF_A_CELL = 20
+"""Keypoints of a cell from which on their mean residual is shown."""
 _ELLIPSOID_FRAMES = 100
 _SIGMAS_95 = 2.7955
 """Half the size of the ellipsoid that holds 95 % of a position in space, in standard deviations."""
@@ -228,40 +232,40 @@ def _image_statistics(drawing: Drawing, camera: int, width: float, height: float
     index = c.frame_index[camera].cpu()
     own = (index >= 0).nonzero()[:, 0]
     own = own[:: 1 + len(own) * c.points.shape[1] // _CELL_KEYPOINTS]
-    residuals = c.residuals_px[camera].detach().double().cpu()[own]
-    used = c.inliers[camera].cpu()[own]
-    places = drawing.projections(index[own], slice(camera, camera + 1))[0] - residuals
-    found = used & places.isfinite().all(-1)
+    residuals = c.residuals_px[camera].detach().double().cpu()[own].numpy()
+    used = c.inliers[camera].cpu()[own].numpy()
+    places = drawing.projections(index[own], slice(camera, camera + 1))[0].numpy() - residuals
+    found = used & np.isfinite(places).all(-1)
     places, sizes = places[found], residuals[found]
     columns = _CELLS if width >= height else max(1, round(_CELLS * width / height))
     rows = _CELLS if height > width else max(1, round(_CELLS * height / width))
-    x = (places[:, 0] / width * columns).floor().long().clamp(0, columns - 1)
-    y = (places[:, 1] / height * rows).floor().long().clamp(0, rows - 1)
-    counts = torch.zeros(rows * columns).double().index_add(0, y * columns + x, torch.ones(len(x)).double())
-    sums = torch.zeros(rows * columns, 2).double().index_add(0, y * columns + x, sizes)
-    least = 20
-    means = (sums / counts[:, None]).where(counts[:, None] >= least, torch.nan)
-    aside = residuals[~used & residuals.isfinite().all(-1)]
+    x, y = (places / (width, height) * (columns, rows)).clip(0, (columns - 1, rows - 1)).astype(np.int64).T
+    cell, cells = y * columns + x, rows * columns
+    counts = np.bincount(cell, minlength=cells)
+    sums = np.stack([np.bincount(cell, axis, cells) for axis in sizes.T], axis=1)
+    means = np.where(counts >= _LEAST_OF_A_CELL, sums.T / counts.clip(1), np.nan).T
+    aside = residuals[~used & np.isfinite(residuals).all(-1)]
     return {
         "columns": columns,
         "rows": rows,
-        "density": packed_shares((counts / counts.max().clamp_min(1)).sqrt()),
-        "covered": float((counts > 0).double().mean()),
-        "means": packed(means),
+        "density": packed_shares(torch.from_numpy(counts / counts.max(initial=1)).sqrt()),
+        "covered": float((counts > 0).mean()),
+        "means": packed(torch.from_numpy(means)),
         "cloud": packed_roots(_thinned(sizes)),
         "aside": packed_roots(_thinned(aside)),
         "limit": _limit(sizes),
     }
 
 
-def _thinned(values: Tensor) -> Tensor:
-    return values[:: 1 + len(values) // _CLOUD]
+def _thinned(values: NDArray[np.float64]) -> Tensor:
+    return torch.from_numpy(values[:: 1 + len(values) // _CLOUD])
 
 
-def _limit(residuals: Tensor) -> float:
+def _limit(residuals: NDArray[np.float64]) -> float:
     """Up to where residuals are shown."""
-    sizes = residuals.abs().flatten()
-    return 1.1 * max(0.01, float(sizes.kthvalue(max(1, round(0.99 * len(sizes)))).values)) if len(sizes) else 1.0
+    sizes = np.abs(residuals).ravel()
+    rank = max(1, round(0.99 * len(sizes))) - 1
+    return 1.1 * max(0.01, float(np.partition(sizes, rank)[rank])) if len(sizes) else 1.0
 
 
 def _images(drawing: Drawing) -> dict[str, Any]:
