@@ -108,20 +108,21 @@ def _reduced(gradients: Tensor, blocks: Tensor, points: Tensor, seen: Tensor, pe
         seen: (n,), whether two cameras or more see a point.
         per_frame: P.
     """
-    cameras, columns = len(blocks), blocks.shape[-1]
-    frames = columns // per_frame
-    total = blocks.sum(0).where(seen, blocks.new_tensor(IDENTITY)[:, None])
-    lower = cholesky(total)
+    lower = cholesky(blocks.sum(0).where(seen, blocks.new_tensor(IDENTITY)[:, None]))
     rows = cross_rows(blocks[None], points[None])[0]
-    turned = torch.linalg.cross(points.expand(cameras, 6, 3, columns), rows, dim=2)
-    own = torch.cat([rows, turned], dim=2).unflatten(-1, (frames, per_frame)).sum(-1)
-    half = forward(lower, rows)
-    solved = forward(lower, gradients.sum(0))
-    direct = torch.cat([gradients, torch.linalg.cross(points.expand_as(gradients), gradients, dim=1)], dim=1)
-    pulls = (direct - (half * solved).sum(2)).unflatten(-1, (frames, per_frame)).sum(-1).movedim(-1, 0)
-    by_frame = half.flatten(0, 1).unflatten(-1, (frames, per_frame)).permute(2, 0, 1, 3).flatten(2)
-    information = -by_frame @ by_frame.mT
-    for camera in range(cameras):
-        place = slice(6 * camera, 6 * camera + 6)
-        information[:, place, place] += own[camera].permute(2, 0, 1)
+
+    def by_frame(values: Tensor) -> Tensor:
+        """(..., a, n) as (f, ..., a P)."""
+        return values.unflatten(-1, (-1, per_frame)).movedim(-2, 0).flatten(-2)
+
+    half, solved = by_frame(forward(lower, rows)).flatten(1, 2), by_frame(forward(lower, gradients.sum(0)))
+    homogeneous = torch.cat([torch.ones_like(points[:1]), points]).unflatten(-1, (-1, per_frame)).permute(1, 2, 0)
+    forces = torch.cat([gradients[:, None], rows], dim=1).unflatten(-1, (-1, per_frame)).movedim(-2, 0)
+    force, moments = (forces.flatten(1, 3) @ homogeneous).view(*forces.shape[:-1], 4).split((1, 3), dim=-1)
+    torque = torch.stack([moments[..., j, i] - moments[..., i, j] for i, j in ((1, 2), (2, 0), (0, 1))], dim=-1)
+    direct = torch.cat([force[..., 0], torque], dim=-1)
+    pulls = direct[:, :, 0] - (half @ solved[..., None]).view(len(half), -1, 6)
+    information = -half @ half.mT
+    own = information.view(len(half), len(blocks), 6, len(blocks), 6).diagonal(dim1=1, dim2=3)
+    own += direct[:, :, 1:].permute(0, 2, 3, 1)
     return pulls, information
