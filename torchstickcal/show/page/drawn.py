@@ -165,7 +165,7 @@ def _scene(drawing: Drawing) -> dict[str, Any]:
     around = points - middle
     far = around.norm(dim=-1) > _FAR * radius
     around[far] = torch.nan
-    size, ellipsoids, ellipsoid_frames = _point_ellipsoids(c, frames)
+    size, ellipsoids, ellipsoid_frames = _point_ellipsoids(drawing, frames)
     return {
         "middle": middle.tolist(),
         "radius": radius,
@@ -181,12 +181,12 @@ def _scene(drawing: Drawing) -> dict[str, Any]:
     }
 
 
-def _point_ellipsoids(calibration: Calibration, frames: Tensor) -> tuple[float | None, dict[str, Any], int]:
+def _point_ellipsoids(drawing: Drawing, frames: Tensor) -> tuple[float | None, dict[str, Any], int]:
     """Typical size, half axes and number of the points' ellipsoids, in frames evenly among those drawn."""
-    c = calibration
+    c = drawing.calibration
     chosen = frames[torch.linspace(0, len(frames) - 1, min(_ELLIPSOID_FRAMES, len(frames))).round().long()]
     lens = None if c.distortion is None else c.distortion.double().cpu()
-    seen = Drawing(c).common(c.inliers.cpu(), chosen, False)
+    seen = drawing.common(c.inliers.cpu(), chosen, False)
     points = c.points.detach().double().cpu()[chosen]
     covariances = point_covariances(
         points.flatten(0, 1),
