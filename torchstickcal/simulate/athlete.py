@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import astuple, dataclass, field, fields
+from dataclasses import dataclass, field, fields
 
 import numpy as np
 from numpy.typing import NDArray
@@ -178,7 +178,7 @@ def _posture(action: Action, times: Array, variation: float, seed: int) -> Array
     Each repetition has key postures of its own, drawn from a generator seeded with the number of the repetition.
     """
     key_times = np.array([time for time, _ in action.keys])
-    values = np.array([[*astuple(posture)[:-2], *posture.left_foot, *posture.right_foot] for _, posture in action.keys])
+    values = np.array([np.hstack(list(vars(posture).values())) for _, posture in action.keys])
     gaps = np.diff(key_times, append=action.period_s)
     slack = np.minimum(gaps, np.roll(gaps, 1))
     first, last = (int(np.floor(time / action.period_s)) for time in (times[0], times[-1]))

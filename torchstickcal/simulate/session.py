@@ -158,6 +158,7 @@ class SessionSpec:
         times = np.arange(self.frames) / self.fps
         offsets = self.clocks.offsets(self.cameras, rng_clocks)
         points = exposed_points(motion, rig, times + offsets[:, None], self.clocks.readout_s)
+        at_frames = motion.points(times) if self.clocks.readout_s else points[0].copy()  # the first camera's clock is right
         shape = points.shape[:3]
         views = Views(rig, points, rig.project(points), np.ones(shape, dtype=bool), np.zeros(shape))
         views = apply(self.regimes, views, rng_keypoints)
@@ -179,7 +180,7 @@ class SessionSpec:
         truth = Truth(
             rotations=torch.from_numpy(rig.rotations),
             translations=torch.from_numpy(rig.translations),
-            points=torch.from_numpy(motion.points(times)),
+            points=torch.from_numpy(at_frames),
             intrinsics=torch.from_numpy(rig.intrinsics),
             distortion=None if rig.distortion is None else torch.from_numpy(rig.distortion),
             time_offsets_s=torch.from_numpy(offsets),
