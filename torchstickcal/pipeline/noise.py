@@ -202,13 +202,29 @@ class HeldNoise:
         kept = self._kept(measurements)
         return Objective(kept, self.noise.losses(kept, NoiseLevels(*levels)))
 
-    def minimum_near(self, measurements: Measurements, state: State, to_rounding: bool = True) -> tuple[Linearised, Tensor]:
-        """The minimum whose own noise the objective uses, near a state, and in which sessions it was found, (B,)."""
+    def minimum_near(
+        self, measurements: Measurements, state: State, to_rounding: bool = True, levels: NoiseLevels | None = None
+    ) -> tuple[Linearised, NoiseLevels, Tensor]:
+        """The minimum whose own noise the objective uses, near a state.
 
-        def objective_at(state: State) -> Objective:
-            return self.objective(measurements, self.levels(measurements, state))
+        Args:
+            measurements: the sessions.
+            state: where to begin.
+            to_rounding: whether to go on up to rounding errors.
+            levels: those at the state, where they are known.
 
-        return minimum_near(objective_at, state, cameras_free=True, to_rounding=to_rounding)
+        Returns:
+            The objective at the minimum, the levels there, and in which sessions they were found, (B,).
+        """
+        found: list[NoiseLevels] = []
+
+        def objective_at(at: State) -> Objective:
+            known = levels if at is state else None
+            found[:] = [self.levels(measurements, at) if known is None else known]
+            return self.objective(measurements, *found)
+
+        minimum, converged = minimum_near(objective_at, state, cameras_free=True, to_rounding=to_rounding)
+        return minimum, *found, converged
 
     def _kept(self, measurements: Measurements) -> Measurements:
         return replace(measurements, confidence=measurements.confidence.where(self.inliers, 0.0))
