@@ -23,7 +23,6 @@ from torchstickcal.model.noise import estimate_acceleration_m, sigma_px_of
 from torchstickcal.model.objective import Objective
 from torchstickcal.model.state import State
 from torchstickcal.shapes import extended
-from torchstickcal.solvers.elimination.normal_equations import NormalEquations
 from torchstickcal.solvers.linearised import Linearised
 from torchstickcal.solvers.newton import minimum_near
 
@@ -221,10 +220,10 @@ class HeldNoise:
         def objective_at(at: State) -> Objective:
             known = levels if at is state else None
             found[:] = [self.levels(measurements, at) if known is None else known]
-            return self.objective(measurements, *found)
+            return self.objective(measurements, found[0])
 
         minimum, converged = minimum_near(objective_at, state, cameras_free=True, to_rounding=to_rounding)
-        return minimum, *found, converged
+        return minimum, found[0], converged
 
     def _kept(self, measurements: Measurements) -> Measurements:
         return replace(measurements, confidence=measurements.confidence.where(self.inliers, 0.0))
@@ -250,11 +249,7 @@ class _Levels:
         What lasts of the errors does not shake a track. It makes second differences smaller than the noise says, and would
         leave no acceleration to a point that swings. And only what shakes is to be smoothed.
         """
-        objective, jitter = Objective(self._kept, losses), self._correlation.jitter
-        if self._held is None:
-            variance = NormalEquations(objective, self._state, cameras_free=False).point_variance()
-        else:
-            variance = objective.point_variance(self._state)
+        variance, jitter = Objective(self._kept, losses).point_variance(self._state), self._correlation.jitter
         shaken = variance * jitter.repeat(1, self._kept.frames)
         acceleration_m = estimate_acceleration_m(self._kept, self._state.points, shaken) / jitter[:, None].sqrt()
         self.levels = self.levels._replace(acceleration_m=acceleration_m)

@@ -18,9 +18,9 @@ from torchstickcal.solvers.linearised import Linearised, Tangent, gradient_at
 
 _MAX_ROUNDS = 40
 _TO_ROUNDING, _NEAR, _IN_FLOAT32 = (1e-8, 1e-8), (1e-4, 1e-7), (1e-3, 1e-6)
-"""Length of a step, in standard deviations of the estimate, below which it is the last, and what the last step may leave, by how
-much shorter it is than the one before: for a minimum up to rounding errors, near enough for everything but gradients, and as near
-as float32 allows."""
+"""Length of a step, in standard deviations of the estimate, below which it is the last, and what the last step may leave, by
+how much shorter it is than the one before: for a minimum up to rounding errors, near enough for everything but gradients, and
+as near as float32 allows. The first step is no measure of that: it corrects what the solver has left."""
 _FAR_SIGMAS, _FAR_FROM_NEAR_SIGMAS = 1e-4, 1e-2
 """The same, above which steps that do not become shorter any more say that there is no minimum: rounding errors are smaller."""
 _SLOW, _OLD = 0.3, 3
@@ -60,7 +60,7 @@ def minimum_near(
     is_double = objective.measurements.pixels.dtype == torch.float64
     tolerance, remaining = _IN_FLOAT32 if not is_double else _TO_ROUNDING if to_rounding else _NEAR
     far = _FAR_SIGMAS if is_double and to_rounding else _FAR_FROM_NEAR_SIGMAS
-    shortest = torch.full_like(state.points[:, 0, 0], torch.inf)
+    before = shortest = torch.full_like(state.points[:, 0, 0], torch.inf)
     moving = torch.ones_like(shortest, dtype=torch.bool)
     for _ in range(_MAX_ROUNDS):
         step = at.descent(gradient)
@@ -71,8 +71,8 @@ def minimum_near(
         taken = step.like(acceleration.step(-step.where(falling).flat(), -gradient.where(falling).flat())[0])
         if not back:
             best = trial if bool((shorter | ~moving).all()) else best.replaced(falling, trial)
-            last = shorter & shortest.isfinite() & (length.square() <= remaining * shortest)
-            shortest = torch.where(falling, length, shortest)
+            last = shorter & before.isfinite() & (length.square() <= remaining * shortest)
+            before, shortest = (torch.where(falling, new, old) for new, old in ((shortest, before), (length, shortest)))
             ended = moving & (last | (shortest <= tolerance))
             best = best.replaced(ended, _moved(best, taken)) if bool(ended.any()) else best
             moving &= ~ended & (shorter if age_of_step == 0 else True)
@@ -80,10 +80,7 @@ def minimum_near(
             break
         # A step that has become longer is undone. It is tried again with a new Hessian, unless it had one.
         back = not back and bool((moving & ~shorter).any())
-        if back:
-            trial = best
-        else:
-            trial = best.replaced(moving, _moved(best, taken))
+        trial = best if back else best.replaced(moving, _moved(best, taken))
         objective, age_of_step = objective_at(trial), age
         if back or (slow and age >= _OLD):
             at, age, acceleration = Linearised(objective, trial, cameras_free), 0, Acceleration()
