@@ -11,7 +11,7 @@ from torch import Tensor
 
 from torchstickcal.geometry import projection
 from torchstickcal.geometry.cameras import Intrinsics, PixelMap, inverse_depths
-from torchstickcal.geometry.symmetric import symmetric_product, turned_sum
+from torchstickcal.geometry.symmetric import outer, symmetric_product
 from torchstickcal.losses.camera_point import (
     CameraPointLoss,
     CameraPointSlopes,
@@ -212,11 +212,11 @@ class ReprojectionLoss(CameraPointLoss):
         m = cameras.pixels_with_jacobian(u, v)
         squared = (m.x - pixels[..., 0, :]).square() + (m.y - pixels[..., 1, :]).square()
         weights = self.weight * information * self.kernel.weight(squared * information) * inverse_depth.square()
-        # In each camera's own axes, the derivatives of the pixel's x and y by the point, times the depth.
-        x_of, y_of = (m.dx_du, m.dx_dv, -(m.dx_du * u + m.dx_dv * v)), (m.dy_du, m.dy_dv, -(m.dy_du * u + m.dy_dv * v))
-        pairs = [(i, j) for i in range(3) for j in range(i, 3)]
-        blocks = torch.stack([weights * (x_of[i] * x_of[j] + y_of[i] * y_of[j]) for i, j in pairs], dim=-2)
-        return turned_sum(blocks, rotations)
+        first, second, third = rotations[..., None].unbind(-3)
+        p, q = first - u.unsqueeze(-2) * third, second - v.unsqueeze(-2) * third
+        by_x = p * m.dx_du.unsqueeze(-2) + q * m.dx_dv.unsqueeze(-2)
+        by_y = p * m.dy_du.unsqueeze(-2) + q * m.dy_dv.unsqueeze(-2)
+        return ((outer(by_x) + outer(by_y)) * weights.unsqueeze(-2)).sum(-3)
 
 
 @register_loss("reprojection")

@@ -16,8 +16,6 @@ IDENTITY = (1.0, 0.0, 0.0, 1.0, 0.0, 1.0)
 """The entries of the identity."""
 
 _ENTRIES = [0, 1, 2, 1, 3, 4, 2, 4, 5]
-_UPPER = [0, 1, 2, 4, 5, 8]
-"""Where the six entries are among the nine of a matrix."""
 _RELATIVE_PIVOT_FLOOR = {torch.float64: 1e-13, torch.float32: 1e-6}
 
 
@@ -47,14 +45,6 @@ def gram(matrices: Tensor) -> Tensor:
     """The six entries (..., 6, N) of A^T A, for matrices stored as (..., column, row, N)."""
     a, b, c = matrices.unbind(-3)
     return torch.stack([(p * q).sum(-2) for p, q in ((a, a), (a, b), (a, c), (b, b), (b, c), (c, c))], dim=-2)
-
-
-def turned_sum(entries: Tensor, rotations: Tensor) -> Tensor:
-    """``sum_c R_c^T A_c R_c``, (..., 6, N), of matrices A (..., C, 6, N), N for each of the rotations (..., C, 3, 3)."""
-    products = rotations[..., :, None, :, None] * rotations[..., None, :, None, :]
-    both = (products + products.transpose(-4, -3)).flatten(-2).flatten(-3, -2)[..., _UPPER, :][..., _UPPER]
-    share = both * both.new_tensor([0.5 if entry in DIAGONAL else 1.0 for entry in range(6)])[:, None]
-    return share.flatten(-3, -2).mT @ entries.flatten(-3, -2)
 
 
 def raised(entries: Tensor, damping: Tensor | float) -> Tensor:
