@@ -273,9 +273,9 @@ class CalibrationLayer(nn.Module):
 
 def _side_by_side(sessions: list[int], keypoints: int, device: torch.device) -> list[list[int]]:
     """Sessions of so many keypoints each in groups of about the same size, of which two threads get equally many."""
-    count, total = len(sessions), len(sessions) * keypoints
-    divided = device.type == "cpu" and total > _FEW_KEYPOINTS
-    groups = min(count, 2 * -(-total // (2 * _MOST_KEYPOINTS)) if divided else 1)
+    count, most = len(sessions), max(1, _MOST_KEYPOINTS // keypoints)
+    divided = device.type == "cpu" and count * keypoints > _FEW_KEYPOINTS
+    groups = min(count, 2 * -(-count // (2 * most)) if divided else 1)
     return [sessions[count * group // groups : count * (group + 1) // groups] for group in range(groups)]
 
 
