@@ -22,7 +22,6 @@ from typing import Any, Self
 
 import torch
 from torch import Tensor, nn
-from torch.autograd import forward_ad
 
 from torchstickcal.arrays import tensor_of
 from torchstickcal.errors import ConfigError
@@ -115,9 +114,3 @@ def checked_residuals(loss: Loss, residuals: Tensor, leading: tuple[int, ...]) -
             expected=f"{(*leading, 'm')}, m numbers each; m may be 1",
         )
     return residuals
-
-
-def tangent(value: Tensor) -> Tensor:
-    """The derivative that a dual number carries; zero if it carries none."""
-    dual = forward_ad.unpack_dual(value)
-    return torch.zeros_like(dual.primal) if dual.tangent is None else dual.tangent

@@ -9,10 +9,11 @@ import torch
 from torch import Tensor
 from torch.autograd import forward_ad
 
+from torchstickcal.dual import dual_numbers, tangent
 from torchstickcal.geometry import projection
 from torchstickcal.geometry.cameras import Intrinsics, PixelMap
 from torchstickcal.geometry.symmetric import six_entries
-from torchstickcal.losses.base import Loss, checked_residuals, tangent
+from torchstickcal.losses.base import Loss, checked_residuals
 from torchstickcal.precision import in_common_precision, in_full_precision
 
 
@@ -235,7 +236,7 @@ class CameraPointLoss(Loss, ABC):
             unknowns: what else is unknown of the cameras.
             step: how that changes, (..., C, k); None where it does not.
         """
-        with forward_ad.dual_level():
+        with dual_numbers():
             moving = forward_ad.make_dual(points_cam, moved_cam)
             if unknowns is not None and step is not None:
                 cameras, pixels = unknowns.moved(forward_ad.make_dual(torch.zeros_like(step), step))
@@ -252,7 +253,7 @@ class CameraPointLoss(Loss, ABC):
         _, weights = self._weighted(points_cam, pixels, information, cameras)
         columns: list[Tensor] = []
         for axis in rotations.unbind(-1):
-            with forward_ad.dual_level():
+            with dual_numbers():
                 moving = forward_ad.make_dual(points_cam, axis.unsqueeze(-1).expand_as(points_cam))
                 columns.append(tangent(self._residuals(moving.mT, pixels.mT, cameras)))
         pairs = [(columns[i] * columns[j]).sum(-1) for i in range(3) for j in range(i, 3)]
@@ -298,7 +299,7 @@ class CameraPointLoss(Loss, ABC):
         for component in range(unknowns.components):
             direction = points_cam.new_zeros(*points_cam.shape[:-2], unknowns.components)
             direction[..., component] = 1.0
-            with forward_ad.dual_level():
+            with dual_numbers():
                 cameras, pixels = unknowns.moved(forward_ad.make_dual(torch.zeros_like(direction), direction))
                 found.append(tangent(self.residuals(points_cam.mT, pixels.mT, cameras)))
         return torch.stack(found, dim=-3)

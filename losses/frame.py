@@ -9,9 +9,10 @@ import torch
 from torch import Tensor
 from torch.autograd import forward_ad
 
+from torchstickcal.dual import dual_numbers, tangent
 from torchstickcal.errors import ConfigError
 from torchstickcal.geometry.symmetric import six_entries
-from torchstickcal.losses.base import Loss, checked_residuals, tangent
+from torchstickcal.losses.base import Loss, checked_residuals
 from torchstickcal.precision import at_least_float32, in_full_precision
 
 
@@ -115,7 +116,7 @@ class FrameLoss(Loss, ABC):
         groups = self.groups(sticks)
         known = active[..., groups].all(-1)
         at, along = (values[..., groups].movedim(-4, -1) for values in (points, moved))
-        with forward_ad.dual_level():
+        with dual_numbers():
             squared = self._squared(forward_ad.make_dual(at, along), known, lengths_m)
             return tangent(self.total(squared * self.information(squared))) / 2
 
@@ -133,7 +134,7 @@ class FrameLoss(Loss, ABC):
             for axis in range(3):
                 along = torch.zeros_like(at)
                 along[..., member, axis] = 1.0
-                with forward_ad.dual_level():
+                with dual_numbers():
                     columns.append(tangent(self.residuals(forward_ad.make_dual(at, along), lengths_m)))
             pairs = [weights * (columns[i] * columns[j]).sum(-1) for i in range(3) for j in range(i, 3)]
             found = found.index_add(-1, indices, torch.stack(pairs, dim=-3))

@@ -94,7 +94,7 @@ class ReprojectionLoss(CameraPointLoss):
         )
 
     def of_columns(self, columns: slice | Tensor, points: int) -> Self:
-        return self._repeated(lambda times: times[..., 0, _points_of(columns, points).to(times.device)])
+        return self._repeated(lambda times: _of_columns(times[..., 0, :], columns, points))
 
     def _repeated(self, change: Callable[[Tensor], Tensor]) -> Self:
         """The loss with its ``times`` changed, where it has them."""
@@ -250,9 +250,13 @@ class ReprojectionSettings(LossSettings):
         return ReprojectionLoss(sigma, self.weight, kernel, times)
 
 
-def _points_of(columns: slice | Tensor, points: int) -> Tensor:
-    """The points that some columns are of, with ``points`` points in each frame."""
-    return (torch.arange(columns.start, columns.stop) if isinstance(columns, slice) else columns) % points
+def _of_columns(values: Tensor, columns: slice | Tensor, points: int) -> Tensor:
+    """Values (..., P) of the points, for some columns of P points side by side in each frame."""
+    if isinstance(columns, Tensor):
+        return values[..., columns.to(values.device) % points]
+    first, count = columns.start % points, columns.stop - columns.start
+    frames = -(-(first + count) // points)
+    return values.repeat(*[1] * (values.ndim - 1), frames)[..., first : first + count]
 
 
 class _Seen(NamedTuple):

@@ -12,7 +12,7 @@ import torchstickcal
 
 ROOT = Path(__file__).parents[1]
 FLOORS = [
-    ["errors", "workers", "processes", "lazy", "precision", "samples"],
+    ["errors", "workers", "processes", "lazy", "precision", "samples", "dual"],
     ["files", "shapes", "arrays", "archives"],
     ["untrusted"],
     ["registry", "skeletons"],

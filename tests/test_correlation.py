@@ -177,6 +177,15 @@ def test_repeated_residuals_are_judged_by_themselves():
     torch.testing.assert_close(kernel.curvature(squared), curvature)
 
 
+@pytest.mark.parametrize("columns", [slice(0, 20), slice(5, 15), slice(3, 4), slice(7, 19), slice(2, 2)])
+def test_times_of_some_columns(columns: slice):
+    loss = ReprojectionLoss(times=torch.arange(1.0, 11.0).view(2, 1, 1, 5))
+    kernels = [loss.of_columns(chosen, 5).kernel for chosen in (columns, torch.arange(columns.start, columns.stop))]
+    times = [kernel.times for kernel in kernels if isinstance(kernel, Repeated)]
+    assert torch.equal(*times)
+    assert times[0].shape == (2, 1, columns.stop - columns.start)
+
+
 def test_no_variance_is_negative_or_not_a_number_whatever_the_residuals_are():
     spoiled = torch.tensor([[[1.0, 3.0], [3.0, 1.0]], [[torch.nan, 0.0], [0.0, 1.0]], [[2.0, 0.5], [0.5, 2.0]]])
     found = correlated._not_below(spoiled, torch.tensor([0.5, 0.5, 0.5]))

@@ -140,6 +140,27 @@ def test_triangulation_is_exact_and_robust():
     assert triangulate(truth.rotations, truth.translations, rays, weights, scale=0.01)[:, 3].isnan().all()
 
 
+@pytest.mark.parametrize("noise", [Noise(0.5), Noise(2.0, missing=0.2), Noise(2.0, outliers=0.2)])
+def test_triangulation_ends_where_no_point_moves(noise: Noise, monkeypatch: pytest.MonkeyPatch):
+    observations, truth = golf_session(cameras=5, frames=6, noise=noise)
+    measurements = Measurements.of(observations)
+    rays = measurements.cameras[0].undistort(measurements.pixels[0].movedim(1, -1)).movedim(-1, 1).nan_to_num()
+    solved: list[int] = []
+    solve = triangulation.solve
+    monkeypatch.setattr(triangulation, "solve", lambda *given: solved.append(0) or solve(*given))
+
+    def points(same_place: float) -> tuple[torch.Tensor, int]:
+        monkeypatch.setattr(triangulation, "_SAME_PLACE", same_place)
+        solved.clear()
+        weights = measurements.confidence[0]
+        found = triangulate(truth.rotations, truth.translations, rays, weights, scale=0.02, iterations=40)
+        return found, len(solved)
+
+    (early, rounds), (late, most) = points(triangulation._SAME_PLACE), points(0.0)
+    assert rounds < most
+    torch.testing.assert_close(early, late, rtol=0, atol=1e-4, equal_nan=True)
+
+
 def test_points_of_several_sets_of_cameras_are_triangulated_at_once_as_one_by_one():
     observations, truth = golf_session(cameras=5, frames=4, noise=Noise(2.0, missing=0.2, outliers=0.1))
     measurements = Measurements.of(observations)

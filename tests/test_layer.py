@@ -20,7 +20,9 @@ from torchstickcal import (
     Unrolled,
     calibrate,
 )
+from torchstickcal.layer.layer import _side_by_side
 from torchstickcal.simulate import Noise, golf_session
+from torchstickcal.solvers.linearised import Linearised, Tangent
 
 OBSERVATIONS, TRUTH = golf_session(cameras=4, frames=12, noise=Noise(sigma_px=2.0, missing=0.05))
 OTHER, _ = golf_session(cameras=4, frames=12, noise=Noise(sigma_px=1.0), seed=1)
@@ -137,6 +139,42 @@ def test_a_batch_gives_what_its_sessions_give(name: str):
             torch.testing.assert_close(getattr(together, field)[k], getattr(alone, field), rtol=1e-9, atol=1e-9)
         (expected,) = torch.autograd.grad(readout(alone), one)
         torch.testing.assert_close(gradient[k], expected, rtol=1e-6, atol=1e-9, equal_nan=True)
+
+
+@pytest.mark.parametrize("count", [0, 1, 4, 5, 6, 10, 17, 64])
+@pytest.mark.parametrize("keypoints", [100, 6300, 40_000, 200_000])
+def test_sessions_are_divided_evenly(count: int, keypoints: int):
+    groups = _side_by_side(list(range(count)), keypoints, torch.device("cpu"))
+    assert [session for group in groups for session in group] == list(range(count))
+    sizes = [len(group) for group in groups]
+    assert not sizes or 1 <= max(sizes) <= min(sizes) + 1
+    assert len(groups) < 2 or len(groups) % 2 == 0 or len(groups) == count  # two threads get equally many
+    assert all(size == 1 or size * keypoints <= 64_000 for size in sizes)
+    assert _side_by_side(list(range(count)), keypoints, torch.device("cuda")) == [list(range(count))] * (count > 0)
+
+
+def test_a_minimum_that_no_gradient_passes_through_takes_no_time():
+    solved: list[bool] = []
+
+    class Counting:
+        def solve(self, minimum: Linearised, gradient: Tangent) -> Tangent:
+            solved.append(minimum.cameras_free)
+            return Implicit().solve(minimum, gradient)
+
+    def gradient(share_of_points: float | None) -> Tensor:
+        keypoints = OBSERVATIONS.keypoints.clone().requires_grad_()
+        result = CalibrationLayer(STICK, gradient=Counting())(keypoints, OBSERVATIONS.cameras)
+        value = result.translations.sum()
+        value = value if share_of_points is None else value + share_of_points * result.points.nansum()
+        solved.clear()
+        return torch.autograd.grad(value, keypoints)[0]
+
+    by_cameras = gradient(None)
+    assert solved
+    assert all(solved)
+    by_all = gradient(1e-12)
+    assert not all(solved)
+    torch.testing.assert_close(by_cameras, by_all, rtol=1e-6, atol=1e-10, equal_nan=True)
 
 
 def test_a_session_that_fails_has_a_status_no_gradient_and_no_influence():

@@ -11,9 +11,11 @@ import torch
 from torch import Tensor
 
 from torchstickcal import CalibrationLayer, ConfigError, Intrinsics, LayerResult, Observations, calibrate
+from torchstickcal.geometry.symmetric import inverse_diagonal
 from torchstickcal.losses import CameraPointLoss, FrameLoss
 from torchstickcal.model.objective import Objective
 from torchstickcal.pipeline.adjust import adjust_cameras, begin
+from torchstickcal.pipeline.noise import HeldNoise
 from torchstickcal.pipeline.run import Run
 from torchstickcal.simulate import Noise, SessionSpec, golf_session
 from torchstickcal.simulate.regimes import Views
@@ -231,7 +233,9 @@ def test_information_of_points_is_that_of_the_normal_equations():
     ended = adjust_cameras(begin(tried.given, run), run)
     objective, state = Objective(ended.kept, ended.last.losses), ended.last.minimum
     system, m = NormalEquations(objective, state, cameras_free=False), ended.kept
-    torch.testing.assert_close(objective.point_variance(state)[m.active], system.point_variance()[m.active])
+    torch.testing.assert_close(
+        objective.point_variance(state)[m.active], inverse_diagonal(system.point_hessian).mean(1)[m.active]
+    )
     for loss in objective.losses.values():
         if isinstance(loss, FrameLoss):
             arguments = m.by_frame(state.points), m.sticks, m.lengths_m[:, None], m.by_frame(m.active)
@@ -241,6 +245,22 @@ def test_information_of_points_is_that_of_the_normal_equations():
             points = state.in_cameras().where(m.visible[:, :, None], 1.0)
             arguments = points, state.rotations, m.pixels, m.confidence, m.cameras_at(state)
             torch.testing.assert_close(loss.point_information(*arguments), CameraPointLoss.point_information(loss, *arguments))
+
+
+@pytest.mark.parametrize("name", ["clean", "errors that last"])
+def test_levels_that_are_known_lead_to_the_same_minimum(name: str):
+    tried = CASES[name]
+    run = Run(CalibrationLayer(tried.given.sticks).config, to_rounding=True)
+    ended = adjust_cameras(begin(tried.given, run), run)
+    result, m = ended.last, ended.measurements
+    held = HeldNoise(run.noise_of(result.stage), result.gates, result.inliers)
+    start = result.minimum.scaled(torch.tensor([1.001], dtype=torch.float64))
+    for known in (None, held.levels(m, start)):
+        found, levels, converged = held.minimum_near(m, start, levels=known)
+        assert converged.all()
+        torch.testing.assert_close(found.state.translations, result.minimum.translations, rtol=0, atol=1e-9)
+        for level, expected in zip(levels, held.levels(m, found.state), strict=True):
+            assert torch.equal(level, expected)
 
 
 def test_accelerated_steps_end_a_linear_iteration():

@@ -13,6 +13,7 @@ from torchstickcal.model.objective import Objective
 from torchstickcal.model.state import State
 from torchstickcal.solvers import IterationRecord, Stop, Termination, gradients, solver
 from torchstickcal.solvers.elimination.normal_equations import NormalEquations
+from torchstickcal.solvers.linearised import Linearised
 from torchstickcal.solvers.newton import polish
 
 LOSSES: dict[str, dict[str, Loss]] = {
@@ -67,8 +68,10 @@ def test_the_last_step_is_confirmed_by_its_cost_alone(
 def test_a_run_that_newton_follows_stops_earlier_and_ends_at_the_same_minimum(disturbed: tuple[Measurements, State]):
     objective = Objective(disturbed[0], LOSSES["whitened"])
 
-    def ended(newton_follows: bool, max_iterations: int = 100) -> tuple[Stop, int, State]:
-        termination = Termination(max_iterations, cost_tolerance=1e-3, newton_follows=newton_follows)
+    def ended(newton_follows: bool, max_iterations: int = 100, leaves_last_step: bool = False) -> tuple[Stop, int, State]:
+        termination = Termination(
+            max_iterations, cost_tolerance=1e-3, newton_follows=newton_follows, leaves_last_step=leaves_last_step
+        )
         outcome = run("gauss_newton", objective, disturbed[1], termination)
         return outcome.stops[0], len(outcome.iterations[0]), polish(objective, outcome.state, cameras_free=True)
 
@@ -78,6 +81,20 @@ def test_a_run_that_newton_follows_stops_earlier_and_ends_at_the_same_minimum(di
     torch.testing.assert_close(same.translations, there.translations, rtol=0, atol=1e-9)
     torch.testing.assert_close(same.points, there.points, rtol=0, atol=1e-9)
     assert ended(True, max_iterations=1)[0] == Stop.ITERATIONS  # nothing is known of the next step
+    stop, tried, again = ended(True, leaves_last_step=True)
+    assert stop.converged
+    assert tried < fewer
+    torch.testing.assert_close(again.translations, there.translations, rtol=0, atol=1e-9)
+    assert ended(False, leaves_last_step=True)[1] == steps
+
+
+@pytest.mark.parametrize("start", [1e-1, 1e-3, 1e-5])
+def test_newton_ends_at_the_minimum(disturbed: tuple[Measurements, State], start: float):
+    """From near and far, what is left of the way is a hundred-millionth of the standard deviations."""
+    objective = Objective(disturbed[0], LOSSES["whitened"])
+    near = run("gauss_newton", objective, disturbed[1], Termination(cost_tolerance=start, newton_follows=True)).state
+    at = Linearised(objective, polish(objective, near, cameras_free=True), cameras_free=True)
+    assert float(at.descent(at.gradient).dot(at.gradient).abs().sqrt()) < 1e-8
 
 
 @pytest.mark.parametrize("name", ["gauss_newton", "lbfgs"])

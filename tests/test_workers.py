@@ -16,7 +16,7 @@ import torch
 
 from torchstickcal import calibrate, workers
 from torchstickcal.lazy import cached_property
-from torchstickcal.losses import Loss, ReprojectionLoss, SmoothnessLoss
+from torchstickcal.losses import CameraPointLoss, Loss, ReprojectionLoss, SmoothnessLoss
 from torchstickcal.model.measurements import Measurements
 from torchstickcal.model.objective import Objective
 from torchstickcal.model.state import State
@@ -94,6 +94,19 @@ def test_help_does_not_change_a_bit(
 
     for alone, helped in zip(step(), on_worker(CPU, step), strict=True):
         assert torch.equal(alone, helped)
+
+
+@pytest.mark.usefixtures("two_workers")
+def test_derivatives_of_own_losses_in_several_threads(disturbed: tuple[Measurements, State]):
+    """Dual numbers exist in one thread at a time."""
+    m, state = disturbed
+    given = state.in_cameras(), torch.ones_like(state.in_cameras()), m.pixels, m.confidence, m.cameras
+    expected = CameraPointLoss.slope(ReprojectionLoss(), *given)
+
+    def slopes(_: int) -> bool:
+        return all(torch.equal(CameraPointLoss.slope(ReprojectionLoss(), *given), expected) for _ in range(30))
+
+    assert map_on_workers(CPU, slopes, range(4)) == [True] * 4
 
 
 def _threads_in_child(queue: multiprocessing.SimpleQueue[int]) -> None:

@@ -302,15 +302,18 @@ class Observations:
                 got=tuple(matrix.shape),
                 expected=f"(3, 3) or ({cameras}, 3, 3)",
             )
-        for index, camera in enumerate(matrix.reshape(-1, 3, 3)):
-            usable = (camera.abs() <= _LARGEST_INTRINSIC).all() and (camera.diagonal() >= 1 / _LARGEST_INTRINSIC).all()
-            if not (usable and camera[1, 0] == 0 and bool((camera[2] == camera.new_tensor([0, 0, 1])).all())):
-                raise ObservationError(
-                    "a camera matrix is not invertible or not a camera matrix",
-                    where="intrinsics" if matrix.ndim == 2 else f"intrinsics[{index}]",
-                    got=camera.tolist(),
-                    expected="[[fx, s, cx], [0, fy, cy], [0, 0, 1]] with fx, fy > 0, in pixels",
-                )
+        of_cameras = matrix.reshape(-1, 3, 3)
+        positive = (of_cameras.diagonal(dim1=1, dim2=2) >= 1 / _LARGEST_INTRINSIC).all(1)
+        usable = positive & (of_cameras.abs() <= _LARGEST_INTRINSIC).all((1, 2)) & (of_cameras[:, 1, 0] == 0)
+        usable &= (of_cameras[:, 2] == matrix.new_tensor([0, 0, 1])).all(1)
+        if not bool(usable.all()):
+            index = usable.tolist().index(False)
+            raise ObservationError(
+                "a camera matrix is not invertible or not a camera matrix",
+                where="intrinsics" if matrix.ndim == 2 else f"intrinsics[{index}]",
+                got=of_cameras[index].tolist(),
+                expected="[[fx, s, cx], [0, fy, cy], [0, 0, 1]] with fx, fy > 0, in pixels",
+            )
         if self.distortion is not None:
             shape = tuple(self.distortion.shape)
             if shape[:-1] not in {(), (cameras,)}:

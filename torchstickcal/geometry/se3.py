@@ -6,6 +6,8 @@ Tangents are ordered (translation, rotation) and act on the world's side, ``T <-
 
 from __future__ import annotations
 
+import math
+
 import torch
 from torch import Tensor
 
@@ -26,13 +28,10 @@ def vee(matrices: Tensor) -> Tensor:
 def exp(tangents: Tensor) -> tuple[Tensor, Tensor]:
     """Exponential map of SE(3): tangents (..., 6) to rotations (..., 3, 3) and translations (..., 3)."""
     translation, rotation = tangents[..., :3], tangents[..., 3:]
-    angle_squared = (rotation * rotation).sum(-1)[..., None, None]
-    angle = angle_squared.sqrt()
-    small = angle_squared < 1e-8
-    safe = torch.where(small, torch.ones_like(angle), angle)
-    a = torch.where(small, 1 - angle_squared / 6, safe.sin() / safe)
-    b = torch.where(small, 0.5 - angle_squared / 24, (1 - safe.cos()) / safe**2)
-    c = torch.where(small, 1 / 6 - angle_squared / 120, (safe - safe.sin()) / safe**3)
+    angle = rotation.norm(dim=-1)[..., None, None]
+    # sin(x) / x, (1 - cos(x)) / x^2 and (1 - sin(x) / x) / x^2; rounding errors of the last are multiplied by x^2
+    a, b = torch.sinc(angle / math.pi), torch.sinc(angle / (2 * math.pi)).square() / 2
+    c = (1 - a) / angle.square().clamp_min(1e-30)
     skew = hat(rotation)
     skew_squared = skew @ skew
     identity = torch.eye(3, dtype=tangents.dtype, device=tangents.device)

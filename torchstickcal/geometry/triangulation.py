@@ -13,6 +13,8 @@ _MIN_DEPTH = 1e-3
 _MAX_PAIRS = 36
 _POINTS_AT_ONCE = 8_000
 """Points that pairs of views propose at once: few points take as long as many, and many need memory."""
+_SAME_PLACE = 1e-6
+"""Change of a point, as a share of its depth, below which no further iteration is needed."""
 _DOUBTFUL = 3.0
 """Residual of a view, in scales of the kernel, from which the point is triangulated again from pairs of views."""
 
@@ -92,7 +94,7 @@ def triangulate(
         rays: undistorted, normalised image coordinates, (..., C, 2, N).
         weights: (..., C, N), zero if a camera does not see the point.
         scale: scale of the kernel, in normalised image coordinates. Views with a much larger residual have little weight.
-        iterations: number of iterations.
+        iterations: number of iterations, at most.
         start: points (..., 3, N) by which the views are weighted in the first iteration; None for the weights as given.
 
     Returns:
@@ -112,13 +114,15 @@ def triangulate(
         current = (
             weights / (1 + _squared_residuals(rotations, translations, rays, start.unsqueeze(-3)) / scale / scale).square()
         )
-    points = rays.new_empty(0)
+    points = depth = rays.new_empty(0)
     for iteration in range(iterations):
         if iteration:
             depth = (rotations[..., 2, :] @ points + translations[..., 2:]).clamp_min(_MIN_DEPTH)
             algebraic = (rows * points.unsqueeze(-3)).sum(-2) - targets
             squared = algebraic.square().sum(0) / depth.square()
             current = weights / (depth * (1 + squared / scale / scale)).square()
-        share = current.unsqueeze(-2)
+        share, before = current.unsqueeze(-2), points
         points = solve(torch.where(unseen, identity, (products * share).sum(-3)), (moments * share).sum(-3))
+        if iteration and bool(((points - before).abs() <= _SAME_PLACE * depth.amin(-2, keepdim=True)).all()):
+            break
     return points.where(~unseen, torch.nan)

@@ -32,8 +32,8 @@ from torchstickcal.solvers.gradients import GradientMode, gradient_mode
 from torchstickcal.stick import Stick, located_sticks
 from torchstickcal.workers import map_on_workers
 
-_KEYPOINTS_AT_ONCE = 32_000
-"""Keypoints of the sessions that a CPU solves side by side: more would leave its cache."""
+_FEW_KEYPOINTS, _MOST_KEYPOINTS = 32_000, 64_000
+"""Keypoints of the sessions that a CPU solves side by side: fewer are not divided any further, more would leave its cache."""
 
 
 class CalibrationLayer(nn.Module):
@@ -188,8 +188,7 @@ class CalibrationLayer(nn.Module):
         starts = dict(enumerate(map_on_workers(device, begun, range(len(given.keypoints)))))
         failed = {session: start for session, start in starts.items() if isinstance(start, str)}
         going = {session: start for session, start in starts.items() if isinstance(start, Adjustment)}
-        together = len(going) if device.type != "cpu" else _KEYPOINTS_AT_ONCE // given.keypoints.shape[1:4].numel()
-        chosen = [list(going)[first : first + max(1, together)] for first in range(0, len(going), max(1, together))]
+        chosen = _side_by_side(list(going), given.keypoints.shape[1:4].numel(), device)
 
         def solved(sessions: list[int]) -> LayerResult:
             adjustment = Adjustment.stack([going[session] for session in sessions])
@@ -270,6 +269,14 @@ class CalibrationLayer(nn.Module):
                 got=f"{got[0]} sessions, {got[1]} cameras, {got[2]} unknowns",
                 expected=f"{expected[0]} sessions, {expected[1]} cameras, {expected[2]} unknowns",
             )
+
+
+def _side_by_side(sessions: list[int], keypoints: int, device: torch.device) -> list[list[int]]:
+    """Sessions of so many keypoints each in groups of about the same size, of which two threads get equally many."""
+    count, most = len(sessions), max(1, _MOST_KEYPOINTS // keypoints)
+    divided = device.type == "cpu" and count * keypoints > _FEW_KEYPOINTS
+    groups = min(count, 2 * -(-count // (2 * most)) if divided else 1)
+    return [sessions[count * group // groups : count * (group + 1) // groups] for group in range(groups)]
 
 
 def _not_calibrated(status: str) -> Quality:

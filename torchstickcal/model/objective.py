@@ -24,6 +24,7 @@ from torchstickcal.losses.track import TrackTerms
 from torchstickcal.model.measurements import Measurements
 from torchstickcal.model.state import State
 from torchstickcal.model.unknowns import Columns, ImageMotion, RigUnknowns
+from torchstickcal.workers import map_with_idle_workers
 
 PRIOR = "prior"
 """Name of the term that keeps the further unknowns of the cameras near what was given."""
@@ -139,19 +140,26 @@ class Objective:
         Couplings between points are ignored. It is that of the normal equations, differentiable by measurements and state; zero
         where a point is not known.
         """
-        m, at = self.measurements, self._unknowns_at(state)
-        points, rotations = m.by_frame(state.points), state.rotations
-        information = torch.zeros_like(state.points[:, :1]).expand(-1, 6, -1)
-        for name, loss in self._camera_point.items():
-            loss = loss.of_columns(slice(0, m.num_columns), m.points_per_frame)
-            own = m.confidence * self._information[name]
-            information = information + loss.point_information(state.in_cameras(), rotations, at.pixels, own, at.cameras)
+        m, points = self.measurements, self.measurements.by_frame(state.points)
+        by_chunk = map_with_idle_workers(lambda columns: self._image_information(state, columns), m.chunks())
+        information = torch.cat(by_chunk, dim=-1)
         for loss in self._frame.values():
             own = loss.point_information(points, m.sticks, m.lengths_m[:, None], m.by_frame(m.active))
             information = information + own.flatten(-2)
         known = m.active[:, None]
         identity = information.new_tensor(IDENTITY)[:, None]
         return inverse_diagonal(torch.where(known, information, identity)).mean(1).where(m.active, 0.0)
+
+    def _image_information(self, state: State, columns: slice) -> Tensor:
+        """What the camera-point losses know of the points of some columns n, (B, 6, n); differentiable."""
+        m, at = self.measurements, self._unknowns_at(state, columns)
+        points_cam = state.in_cameras(columns)
+        information = torch.zeros_like(points_cam[:, 0, :1]).expand(-1, 6, -1)
+        for name, loss in self._camera_point.items():
+            own = m.confidence[..., columns] * self._information[name][..., columns]
+            loss = loss.of_columns(columns, m.points_per_frame)
+            information = information + loss.point_information(points_cam, state.rotations, at.pixels, own, at.cameras)
+        return information
 
     def linearise_chunk(
         self, state: State, columns: Columns, exact: bool = False, by_unknowns: bool = True

@@ -88,7 +88,8 @@ def _minimum(
     """
     start = result.minimum if fixed is None else replace(fixed, points=result.minimum.points)
     if levels is None and not at_minimum:
-        return held.minimum_near(data, start)
+        found, _, converged = held.minimum_near(data, start)
+        return found, converged
     objective = held.objective(data, result.noise if levels is None else levels)
     if at_minimum:
         return Linearised(objective, start, cameras_free=fixed is None), result.agrees

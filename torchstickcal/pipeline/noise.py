@@ -23,7 +23,6 @@ from torchstickcal.model.noise import estimate_acceleration_m, sigma_px_of
 from torchstickcal.model.objective import Objective
 from torchstickcal.model.state import State
 from torchstickcal.shapes import extended
-from torchstickcal.solvers.elimination.normal_equations import NormalEquations
 from torchstickcal.solvers.linearised import Linearised
 from torchstickcal.solvers.newton import minimum_near
 
@@ -202,13 +201,29 @@ class HeldNoise:
         kept = self._kept(measurements)
         return Objective(kept, self.noise.losses(kept, NoiseLevels(*levels)))
 
-    def minimum_near(self, measurements: Measurements, state: State, to_rounding: bool = True) -> tuple[Linearised, Tensor]:
-        """The minimum whose own noise the objective uses, near a state, and in which sessions it was found, (B,)."""
+    def minimum_near(
+        self, measurements: Measurements, state: State, to_rounding: bool = True, levels: NoiseLevels | None = None
+    ) -> tuple[Linearised, NoiseLevels, Tensor]:
+        """The minimum whose own noise the objective uses, near a state.
 
-        def objective_at(state: State) -> Objective:
-            return self.objective(measurements, self.levels(measurements, state))
+        Args:
+            measurements: the sessions.
+            state: where to begin.
+            to_rounding: whether to go on up to rounding errors.
+            levels: those at the state, where they are known.
 
-        return minimum_near(objective_at, state, cameras_free=True, to_rounding=to_rounding)
+        Returns:
+            The objective at the minimum, the levels there, and in which sessions they were found, (B,).
+        """
+        found: list[NoiseLevels] = []
+
+        def objective_at(at: State) -> Objective:
+            known = levels if at is state else None
+            found[:] = [self.levels(measurements, at) if known is None else known]
+            return self.objective(measurements, found[0])
+
+        minimum, converged = minimum_near(objective_at, state, cameras_free=True, to_rounding=to_rounding)
+        return minimum, found[0], converged
 
     def _kept(self, measurements: Measurements) -> Measurements:
         return replace(measurements, confidence=measurements.confidence.where(self.inliers, 0.0))
@@ -234,11 +249,7 @@ class _Levels:
         What lasts of the errors does not shake a track. It makes second differences smaller than the noise says, and would
         leave no acceleration to a point that swings. And only what shakes is to be smoothed.
         """
-        objective, jitter = Objective(self._kept, losses), self._correlation.jitter
-        if self._held is None:
-            variance = NormalEquations(objective, self._state, cameras_free=False).point_variance()
-        else:
-            variance = objective.point_variance(self._state)
+        variance, jitter = Objective(self._kept, losses).point_variance(self._state), self._correlation.jitter
         shaken = variance * jitter.repeat(1, self._kept.frames)
         acceleration_m = estimate_acceleration_m(self._kept, self._state.points, shaken) / jitter[:, None].sqrt()
         self.levels = self.levels._replace(acceleration_m=acceleration_m)

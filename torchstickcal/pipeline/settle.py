@@ -40,10 +40,9 @@ def settled(name: str, measurements: Measurements, result: StageResult, run: Run
     def near() -> Chosen:
         return Chosen(near_keypoints(measurements, squared), NEAR_SIGMAS)
 
-    *_, gates = noise.decided(kept, at, squared, noise.chosen(kept, near))
+    _, levels, gates = noise.decided(kept, at, squared, noise.chosen(kept, near))
     held = HeldNoise(noise, gates, result.inliers)
-    found, converged = held.minimum_near(measurements, at, run.to_rounding)
-    levels = held.levels(measurements, found.state)
+    found, levels, converged = held.minimum_near(measurements, at, run.to_rounding, levels)
     run.took(name, time.perf_counter() - began)
     return _with_minimum(result, found, run)._replace(noise=levels, gates=gates, agrees=converged), converged
 

@@ -133,7 +133,7 @@ def run_stage(
         objective,
         state,
         cameras_free=stage.cameras == "free",
-        termination=Termination(stage.max_iterations, tolerance, newton_follows=least > 0),
+        termination=Termination(stage.max_iterations, tolerance, newton_follows=least > 0, leaves_last_step=run.to_rounding),
         stage=name,
         listener=run.listener,
     )

@@ -42,12 +42,15 @@ class Termination:
             outliers.
         newton_follows: whether Newton's method goes on from where the solver stops. It then stops as soon as the next step
             promises to decrease the cost by less than the tolerance, without trying it, unless only one step is allowed.
+        leaves_last_step: whether then the last step that is taken is not tried either. Newton's method evaluates the objective
+            there, and whoever runs it begins again where that leads to no minimum.
     """
 
     max_iterations: int = 100
     cost_tolerance: float = 1e-9
     camera_tolerance: float = 1e-4
     newton_follows: bool = False
+    leaves_last_step: bool = False
 
 
 @dataclass(frozen=True)

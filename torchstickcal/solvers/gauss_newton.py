@@ -73,6 +73,9 @@ def gauss_newton(
             steps_m = _largest_components(step)
             trial = best.retracted(step.cameras, step.points, step.unknowns)
             del step
+            left = [session.leaves_step for session in sessions]
+            if any(left):
+                best = best.replaced(torch.tensor(left, device=device), trial)
         del system
         if all(session.stop for session in sessions):
             stops = tuple(session.stop or Stop.ITERATIONS for session in sessions)
@@ -106,6 +109,7 @@ class _SessionControl:
         self._shrinkage = 0.0 if hands_over else 1.0
         """predicted decrease of the cost over that of the step before; for the first step, what is assumed"""
         self._negligible_share = 1.0 if hands_over else _NEGLIGIBLE_SHARE
+        self._leaves_last_step = hands_over and termination.leaves_last_step
         self._trial_damping, self._factor, self._rejected = _INITIAL_DAMPING, _DECREASE, False
         self.damping = _INITIAL_DAMPING
         self.iteration = -1
@@ -114,6 +118,11 @@ class _SessionControl:
         """whether the session has a trial state that differs from its best state"""
         self.at_best = False
         """whether the last system was built at the session's best state"""
+
+    @property
+    def leaves_step(self) -> bool:
+        """Whether the session has stopped at its trial state, which nobody has tried."""
+        return self.stop is not None and self.has_trial
 
     @property
     def is_ending(self) -> bool:
@@ -163,6 +172,8 @@ class _SessionControl:
             self._predicted, self._damped_share, self._camera_sigmas = predicted, damped_share, camera_sigmas
             self._trial_damping = self.damping
             self.damping = max(self.damping * self._factor, _MIN_DAMPING)
+            if self._leaves_last_step:
+                self.stop = self._stop_after(predicted)
 
     def _on_accepted(self, decrease: float) -> None:
         """Choose the next damping by the actual decrease of the cost, and test for convergence."""

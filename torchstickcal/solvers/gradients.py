@@ -212,6 +212,25 @@ class _Minimum(torch.autograd.Function):
         incoming = State(*gradients)
         known = minimum.objective.measurements.active[:, None]
         gradient = tangent_gradient(at, replace(incoming, points=incoming.points.where(known, 0.0)), free)
+        if bool(gradient.nonzero.any()):
+            by_inputs = _Minimum._by_inputs(ctx, gradient, needed)
+        else:
+            by_inputs = [torch.zeros_like(v) if need else None for v, need in zip(ctx.saved_tensors, needed, strict=True)]
+
+        # Cameras that are held fixed are also passed through unchanged: add the incoming gradient.
+        if not free:
+            passed = (incoming.rotations, incoming.translations, incoming.unknowns)
+            by_inputs[:_RIG_INPUTS] = [
+                direct if through_points is None else direct + through_points
+                for direct, through_points in zip(passed, by_inputs[:_RIG_INPUTS], strict=True)
+            ]
+        return None, None, None, None, *by_inputs
+
+    @staticmethod
+    def _by_inputs(ctx: Any, gradient: Tangent, needed: Sequence[bool]) -> list[Tensor | None]:
+        """The derivatives by the inputs that need them, through the minimum, for a gradient by its tangents."""
+        minimum = ctx.minimum
+        at, free = minimum.state, minimum.cameras_free
 
         # 1. The objective once more, differentiable by all inputs and by the levels of the noise.
         inputs = zip(ctx.saved_tensors, needed, strict=True)
@@ -229,16 +248,7 @@ class _Minimum(torch.autograd.Function):
             differentiable = [leaf for leaf in leaves if leaf is not None and leaf.requires_grad]
             found = iter(levels.total(slope, differentiable))
         by_inputs = [next(found) if leaf is not None and leaf.requires_grad else None for leaf in leaves]
-        by_inputs = [None if v is None else _where_nonzero(adjoint, v) for v in by_inputs]
-
-        # 4. Cameras that are held fixed are also passed through unchanged: add the incoming gradient.
-        if not free:
-            passed = (incoming.rotations, incoming.translations, incoming.unknowns)
-            by_inputs[:_RIG_INPUTS] = [
-                direct if through_points is None else direct + through_points
-                for direct, through_points in zip(passed, by_inputs[:_RIG_INPUTS], strict=True)
-            ]
-        return None, None, None, None, *by_inputs
+        return [None if v is None else _where_nonzero(adjoint, v) for v in by_inputs]
 
 
 class _Levels:

@@ -17,13 +17,12 @@ from torchstickcal.solvers.acceleration import Acceleration
 from torchstickcal.solvers.linearised import Linearised, Tangent, gradient_at
 
 _MAX_ROUNDS = 40
-_ROUNDING_SIGMAS, _NEAR_SIGMAS, _FLOAT32_SIGMAS = 1e-8, 1e-4, 1e-3
-"""Length of a step, in standard deviations of the estimate, below which it is the last: for a minimum up to rounding errors,
-near enough for everything but gradients, and as near as float32 allows."""
+_TO_ROUNDING, _NEAR, _IN_FLOAT32 = (1e-8, 1e-8), (1e-4, 1e-7), (1e-3, 1e-6)
+"""Length of a step, in standard deviations of the estimate, below which it is the last, and what the last step may leave, by
+how much shorter it is than the one before: for a minimum up to rounding errors, near enough for everything but gradients, and
+as near as float32 allows. The first step is no measure of that: it corrects what the solver has left."""
 _FAR_SIGMAS, _FAR_FROM_NEAR_SIGMAS = 1e-4, 1e-2
 """The same, above which steps that do not become shorter any more say that there is no minimum: rounding errors are smaller."""
-_REMAINING = 0.001
-"""What a step leaves, as a share of that length, below which it is the last as well: as much shorter as it was made shorter."""
 _SLOW, _OLD = 0.3, 3
 """Ratio of the lengths of two steps, and number of steps with one Hessian, from which on it is built anew."""
 
@@ -59,31 +58,29 @@ def minimum_near(
     at, acceleration = Linearised(objective_at(trial), trial, cameras_free), Acceleration()
     objective, gradient, age, age_of_step, back = at.objective, at.gradient, 0, 0, False
     is_double = objective.measurements.pixels.dtype == torch.float64
-    tolerance = _FLOAT32_SIGMAS if not is_double else _ROUNDING_SIGMAS if to_rounding else _NEAR_SIGMAS
-    far = _FAR_SIGMAS if tolerance == _ROUNDING_SIGMAS else _FAR_FROM_NEAR_SIGMAS
-    shortest = torch.full_like(state.points[:, 0, 0], torch.inf)
+    tolerance, remaining = _IN_FLOAT32 if not is_double else _TO_ROUNDING if to_rounding else _NEAR
+    far = _FAR_SIGMAS if is_double and to_rounding else _FAR_FROM_NEAR_SIGMAS
+    before = shortest = torch.full_like(state.points[:, 0, 0], torch.inf)
     moving = torch.ones_like(shortest, dtype=torch.bool)
     for _ in range(_MAX_ROUNDS):
         step = at.descent(gradient)
         length = step.dot(gradient).clamp_min(0.0).sqrt()
         shorter = length < shortest
         slow = bool((moving & ~(length < _SLOW * shortest)).any())
+        falling = moving if back else moving & shorter
+        taken = step.like(acceleration.step(-step.where(falling).flat(), -gradient.where(falling).flat())[0])
         if not back:
-            best = trial if bool((shorter | ~moving).all()) else best.replaced(moving & shorter, trial)
-            last = shorter & shortest.isfinite() & (length.square() <= _REMAINING * tolerance * shortest)
-            shortest = torch.where(moving & shorter, length, shortest)
+            best = trial if bool((shorter | ~moving).all()) else best.replaced(falling, trial)
+            last = shorter & before.isfinite() & (length.square() <= remaining * shortest)
+            before, shortest = (torch.where(falling, new, old) for new, old in ((shortest, before), (length, shortest)))
             ended = moving & (last | (shortest <= tolerance))
-            best = best.replaced(ended, _moved(best, step, -1.0)) if bool(ended.any()) else best
+            best = best.replaced(ended, _moved(best, taken)) if bool(ended.any()) else best
             moving &= ~ended & (shorter if age_of_step == 0 else True)
         if not bool(moving.any()):
             break
         # A step that has become longer is undone. It is tried again with a new Hessian, unless it had one.
         back = not back and bool((moving & ~shorter).any())
-        if back:
-            trial = best
-        else:
-            moved, _ = acceleration.step(-step.where(moving).flat(), -gradient.where(moving).flat())
-            trial = best.replaced(moving, _moved(best, step.like(moved), 1.0))
+        trial = best if back else best.replaced(moving, _moved(best, taken))
         objective, age_of_step = objective_at(trial), age
         if back or (slow and age >= _OLD):
             at, age, acceleration = Linearised(objective, trial, cameras_free), 0, Acceleration()
@@ -93,6 +90,6 @@ def minimum_near(
     return Linearised(objective_at(best), best, cameras_free), shortest < far
 
 
-def _moved(state: State, step: Tangent, factor: float) -> State:
-    """The state after so many times a step."""
-    return state.retracted(factor * step.cameras, factor * step.points, factor * step.unknowns)
+def _moved(state: State, step: Tangent) -> State:
+    """The state after a step."""
+    return state.retracted(step.cameras, step.points, step.unknowns)

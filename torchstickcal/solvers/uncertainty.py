@@ -123,7 +123,7 @@ def point_variances(measurements: Measurements, state: State, sigma_px: Tensor) 
         sigma_px: noise of each point's keypoints, (B, P).
     """
     objective = Objective(measurements, {"reprojection": ReprojectionLoss(sigma_px[:, None, None])})
-    variance = NormalEquations(objective, state, cameras_free=False).point_variance().double()
+    variance = objective.point_variance(state)
     return variance.where(measurements.active, torch.inf)
 
 

@@ -16,6 +16,7 @@ import torch
 from torch import Tensor
 from torch.autograd import forward_ad
 
+from torchstickcal.dual import dual_numbers, tangent
 from torchstickcal.geometry.cameras import Intrinsics, PixelMap
 
 Columns = slice | Tensor
@@ -211,7 +212,5 @@ def _derivative(function: Callable[[Tensor], tuple[Tensor, ...]], at: Tensor, co
     """Derivatives of a function's tensors by one of the numbers of all cameras, of a point (..., C, n)."""
     direction = torch.zeros_like(at)
     direction[..., component] = 1.0
-    with forward_ad.dual_level():
-        outputs = function(forward_ad.make_dual(at, direction))
-        unpacked = [forward_ad.unpack_dual(output) for output in outputs]
-        return tuple(torch.zeros_like(dual.primal) if dual.tangent is None else dual.tangent for dual in unpacked)
+    with dual_numbers():
+        return tuple(map(tangent, function(forward_ad.make_dual(at, direction))))

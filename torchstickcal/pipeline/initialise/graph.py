@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import NamedTuple
 
 import cv2
@@ -279,15 +279,14 @@ def _place_cameras(
     support = float(root.in_front)
     for edge in edges[1:]:
         known = _points(triangulate, placed, rotations, translations, rays, visible, scale)
-        candidates = [_place_camera(pose, edge, rotations, translations, known, rays, visible, scale) for pose in edge.poses]
+        candidates = _candidates(edge, rotations, translations, known, rays, visible, scale)
         gained, rotations[edge.child], translations[edge.child] = max(candidates, key=lambda candidate: candidate[0])
         support += gained
         placed.append(edge.child)
     return support, rotations, translations
 
 
-def _place_camera(
-    pose: RelativePose,
+def _candidates(
     edge: Edge,
     rotations: Array,
     translations: Array,
@@ -295,23 +294,24 @@ def _place_camera(
     rays: Array,
     visible: NDArray[np.bool_],
     scale: float,
-) -> tuple[float, Array, Array]:
-    """Support, rotation and translation of the child of an edge, for one relative pose.
+) -> Iterator[tuple[float, Array, Array]]:
+    """Support, rotation and translation of the child of an edge, for each of the edge's relative poses.
 
     The length of the baseline is the median ratio of the depths of known points to their depths for a baseline of length 1. The
     support is the sum of the kernel weights of the known points that the child sees.
     """
     parent, child = edge.parent, edge.child
-    common = np.flatnonzero(visible[parent] & visible[child] & np.isfinite(known[0]))
-    depth_known = rotations[parent, 2] @ known[:, common] + translations[parent, 2]
-    depth_pair, _ = two_view_depths(pose.rotation, pose.translation, rays[parent][:, common], rays[child][:, common])
-    usable = (depth_pair > 0) & (depth_known > 0)
-    baseline = float(np.median(depth_known[usable] / depth_pair[usable])) if usable.any() else 1.0
-    rotation = pose.rotation @ rotations[parent]
-    translation = pose.rotation @ translations[parent] + baseline * pose.translation
     seen = np.flatnonzero(visible[child] & np.isfinite(known[0]))
-    weights = _kernel_weights(rotation, translation, known[:, seen], rays[child][:, seen], scale)
-    return float(weights.sum()), rotation, translation
+    points, own, shared = known[:, seen], rays[child][:, seen], visible[parent, seen]
+    depth_known = rotations[parent, 2] @ points[:, shared] + translations[parent, 2]
+    of_parent, of_child = rays[parent][:, seen[shared]], own[:, shared]
+    for pose in edge.poses:
+        depth_pair, _ = two_view_depths(pose.rotation, pose.translation, of_parent, of_child)
+        usable = (depth_pair > 0) & (depth_known > 0)
+        baseline = float(np.median(depth_known[usable] / depth_pair[usable])) if usable.any() else 1.0
+        rotation = pose.rotation @ rotations[parent]
+        translation = pose.rotation @ translations[parent] + baseline * pose.translation
+        yield float(_kernel_weights(rotation, translation, points, own, scale).sum()), rotation, translation
 
 
 def _disconnected(

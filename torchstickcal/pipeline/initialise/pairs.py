@@ -145,9 +145,9 @@ def _parallax(rotation: Array, a: Array, b: Array) -> float:
     """Median angle between the rays to the same points, radians."""
     if not a.shape[1]:
         return 0.0
-    first, second = rotation @ _homogeneous(a), _homogeneous(b)
-    sine = np.linalg.norm(np.cross(first, second, axis=0), axis=0)
-    return float(np.median(np.arctan2(sine, (first * second).sum(0))))
+    (x, y, z), (u, v) = rotation @ _homogeneous(a), b
+    sine = np.hypot(np.hypot(y - z * v, z * u - x), x * v - y * u)
+    return float(np.median(np.arctan2(sine, x * u + y * v + z)))
 
 
 def _homogeneous(rays: Array) -> Array:

@@ -136,6 +136,8 @@ def mended(
     if (touched := labels.touched[0].any(0)).any():
         labels, measurements, state = with_labels(Labels.as_given(measurements), touched)
         residuals = _Residuals.of(measurements, state)
+    elif not residuals.gross.any():
+        return given
     for exchange in exchanges(measurements.point_names, measurements.sticks.tolist()):
         points = torch.tensor(exchange.pairs, device=touched.device).mT.flatten()
         frames = residuals.suspicious(points).nonzero()[:, 0]

@@ -28,7 +28,7 @@ import torch
 from torch import Tensor
 
 from torchstickcal.geometry import se3
-from torchstickcal.geometry.symmetric import DIAGONAL, IDENTITY, inverse_diagonal, raised
+from torchstickcal.geometry.symmetric import DIAGONAL, IDENTITY, raised
 from torchstickcal.losses.camera_point import CameraPointTerms, UnknownTerms
 from torchstickcal.model.objective import Objective
 from torchstickcal.model.state import State
@@ -91,14 +91,19 @@ class _EliminatedPart(NamedTuple):
         """``W^T = (L^-1 H_xc)^T`` (B, 6 C' + K, 3 n), for points (B, 3, n)."""
         return self.elimination.forward_solve_cross(*self.coupling, points) if self.rows is None else self.rows
 
-    def back_substituted(self, rhs: Tensor, points: Tensor, camera_step: Tensor, unknown_step: Tensor) -> Tensor:
-        """``H_xx^-1 (b - H_xc s)`` (B, 3, n), for a right-hand side b (B, 3, n) and a step s of cameras and unknowns."""
+    def back_substituted(
+        self, rhs: Tensor, points: Tensor, camera_step: Tensor, unknown_step: Tensor, forward: Tensor | None = None
+    ) -> Tensor:
+        """``H_xx^-1 (b - H_xc s)`` (B, 3, n), for a right-hand side b (B, 3, n) and a step s of cameras and unknowns.
+
+        ``forward`` is ``L^-1 b``, where it is known.
+        """
         if not self.coupling.camera_blocks.shape[1]:
             return self.elimination.solve(rhs)
         if self.rows is None:
             return self.elimination.solve(rhs - self._cross_product(points, camera_step, unknown_step))
         step = torch.cat([camera_step.flatten(1), unknown_step], dim=1).to(rhs.dtype)
-        forward = self.elimination.forward_solve(rhs)
+        forward = self.elimination.forward_solve(rhs) if forward is None else forward
         return self.elimination.backward_solve(torch.baddbmm(forward[:, None], step[:, None], self.rows, alpha=-1)[:, 0])
 
     def _cross_product(self, points: Tensor, camera_step: Tensor, unknown_step: Tensor) -> Tensor:
@@ -213,9 +218,11 @@ class NormalEquations(Evaluated):
         point_rhs = point_rhs.to(self.point_hessian.dtype)
         reduced_rhs = torch.cat([camera_rhs.flatten(1), unknown_rhs], dim=1)
 
+        forward: dict[Part, Tensor] = {}
+
         def reduced_share(part: Part, eliminated: _EliminatedPart) -> Tensor:
-            solved = eliminated.elimination.forward_solve(point_rhs[..., part.columns])
-            return (eliminated.solved_rows(self._points(part.columns)) @ solved[..., None])[..., 0]
+            forward[part] = eliminated.elimination.forward_solve(point_rhs[..., part.columns])
+            return (eliminated.solved_rows(self._points(part.columns)) @ forward[part][..., None])[..., 0]
 
         for share in self._of_parts(reduced_share) if self._free_cameras else ():
             reduced_rhs = reduced_rhs - share
@@ -226,21 +233,11 @@ class NormalEquations(Evaluated):
 
         def back_substitute(part: Part, eliminated: _EliminatedPart) -> None:
             own = point_rhs[..., part.columns], self.state.points[..., part.columns]
-            points[..., part.columns] = eliminated.back_substituted(*own, cameras, unknowns)
+            points[..., part.columns] = eliminated.back_substituted(*own, cameras, unknowns, forward.get(part))
 
         self._of_parts(back_substitute)
         finite = rig.isfinite().all(1) & points.flatten(1).isfinite().all(1)
         return cameras, unknowns, points, (failed == 0) & finite
-
-    def point_variance(self) -> Tensor:
-        """Variance of each point for known cameras, mean over the three axes, (B, N), square metres.
-
-        Couplings between points are ignored.
-        """
-        variance = torch.empty_like(self.point_hessian[:, 0])
-        for columns in self.objective.measurements.chunks():
-            variance[:, columns] = inverse_diagonal(self.point_hessian[..., columns]).mean(1)
-        return variance
 
     def point_response(self) -> Tensor:
         """``-H_xx^-1 H_xc``: movement of the points per unit step of the cameras, (B, 6 C' + K, 3, N)."""
