@@ -6,6 +6,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable, Hashable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
@@ -51,6 +52,9 @@ _ROUGHLY, _NEARLY = 1e-3, 1e-6
 which keypoints the noise is estimated."""
 _SETTLED = 0.1
 """Relative change of the numbers of keypoints that count as one, below which a stage need not be repeated with new ones."""
+_LASTING_FRAMES, _CLEARLY_SHORTER, _ROUNDS_BY_ENDS = 3.0, 0.5, 2
+"""As many keypoints of a stick's end as count as one, from which on its errors seem to last; the ratio of two such numbers that
+is clearly less than 1; and for how many rounds the ends are trusted alone. After the first, their noise is known."""
 
 
 @dataclass(frozen=True)
@@ -457,19 +461,54 @@ def _finished(
 def through(stages: Iterable[tuple[str, Stage]], adjustment: Adjustment, run: Run, least: float = 0.0) -> Adjustment:
     """After some stages. One in which keypoints count as fewer is repeated, until what they count no longer changes.
 
-    Errors that last are hidden in the cameras, as long as points with such errors determine them.
+    Errors that last are hidden in the cameras, as long as points with such errors determine them. Cameras that joints have
+    deceived contradict the sticks, whose ends then seem to err in the same way for long. So where they do, the stage is also
+    begun from the ends alone, and where their errors last clearly less from there, that is right.
     """
     for name, stage in stages:
-        adjustment = adjustment.ended(run_stage(name, stage, adjustment.measurements, adjustment.state, run, least))
-        before, times = torch.ones_like(adjustment.last.correlation_frames), adjustment.last.correlation_frames
-        for _ in range(_MOST_ROUNDS - 1):
-            unchanged = ((times / before).log().abs() < _SETTLED).flatten(1).all(1)
-            if bool(unchanged.all()):
-                break
-            again = adjustment.ended(run_stage(name, stage, adjustment.measurements, adjustment.state, run, least))
-            adjustment = again.replaced(unchanged, adjustment)
-            before, times = times, adjustment.last.correlation_frames
+        begun, adjustment = adjustment, _repeated(name, stage, adjustment, run, least)
+        lasting = _times_of_ends(adjustment)
+        doubtful = (lasting > _LASTING_FRAMES).any(1)
+        if bool(doubtful.any()):
+            other = _from_ends(name, stage, begun, run, least)
+            less = _times_of_ends(other).log().mean(1) < lasting.log().mean(1) + math.log(_CLEARLY_SHORTER)
+            adjustment = adjustment.replaced(doubtful & less, other)
     return adjustment
+
+
+def _repeated(
+    name: str, stage: Stage, adjustment: Adjustment, run: Run, least: float, times: Tensor | None = None
+) -> Adjustment:
+    """After one stage, which is repeated until what keypoints count no longer changes; arguments as of :func:`run_stage`."""
+    adjustment = adjustment.ended(run_stage(name, stage, adjustment.measurements, adjustment.state, run, least, times))
+    before, found = torch.ones_like(adjustment.last.correlation_frames), adjustment.last.correlation_frames
+    for _ in range(_MOST_ROUNDS - 1):
+        unchanged = ((found / before).log().abs() < _SETTLED).flatten(1).all(1)
+        if bool(unchanged.all()):
+            break
+        again = adjustment.ended(run_stage(name, stage, adjustment.measurements, adjustment.state, run, least, times))
+        adjustment = again.replaced(unchanged, adjustment)
+        before, found = found, adjustment.last.correlation_frames
+    return adjustment
+
+
+def _from_ends(name: str, stage: Stage, adjustment: Adjustment, run: Run, least: float) -> Adjustment:
+    """After one stage, begun as if the errors of the ends of the sticks were independent, and those of all other points always
+    the same; then repeated with what the others are found to count, and once with what the ends are found to count, too."""
+    m = adjustment.measurements
+    times = adjustment.state.points.new_full((m.sessions, m.points_per_frame), float(m.frames))
+    times[:, m.sticks.flatten()] = 1.0
+    for _ in range(_ROUNDS_BY_ENDS):
+        adjustment = adjustment.ended(run_stage(name, stage, m, adjustment.state, run, least, times))
+    adjustment = _repeated(name, stage, adjustment, run, least, times.where(times == 1.0, torch.nan))
+    return adjustment.ended(run_stage(name, stage, m, adjustment.state, run, least))
+
+
+def _times_of_ends(adjustment: Adjustment) -> Tensor:
+    """(B, 2 S), as many keypoints of the ends of sticks as counted as one in the last stage; (B, 0) if there are no other
+    points."""
+    times, ends = adjustment.last.correlation_frames, adjustment.measurements.sticks.flatten()
+    return times[:, ends] if len(set(ends.tolist())) < times.shape[1] else times[:, :0]
 
 
 def _relabelling(stages: Sequence[tuple[str, Stage]], begun: Adjustment, run: Run) -> Adjustment:
