@@ -6,7 +6,6 @@
 
 from __future__ import annotations
 
-import math
 import time
 from collections.abc import Callable, Hashable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
@@ -471,7 +470,7 @@ def through(stages: Iterable[tuple[str, Stage]], adjustment: Adjustment, run: Ru
         doubtful = (lasting > _LASTING_FRAMES).any(1)
         if bool(doubtful.any()):
             other = _from_ends(name, stage, begun, run, least)
-            less = _times_of_ends(other).log().mean(1) < lasting.log().mean(1) + math.log(_CLEARLY_SHORTER)
+            less = _times_of_ends(other).amax(1) < _CLEARLY_SHORTER * lasting.amax(1)
             adjustment = adjustment.replaced(doubtful & less, other)
     return adjustment
 

@@ -28,9 +28,9 @@ __all__ = ["initialise", "triangulated"]
 
 _SUPPORT_SCALE = 10.0
 """Scale of the robust kernels in units of the inlier threshold of RANSAC."""
-_RIGID = 0.03
-"""Change of a stick's length, as a share of it, below which the start is near enough. Sound starts have 0.002 to 0.02, and more
-only among many outliers."""
+_RIGID, _RIGID_OF_TWO = 0.02, 0.01
+"""Change of a stick's length, as a share of it, below which the start is near enough; with two cameras, no third view shows that
+it is not. Sound starts have 0.002 to 0.015, and more only among many outliers."""
 _CLEARLY_LESS, _AS_GOOD = 0.5, 4.0
 """Change of the lengths and squared residual from the ends alone, relative to those from all keypoints, up to which the ends
 are the start."""
@@ -50,7 +50,7 @@ def initialise(measurements: Measurements, settings: InitialiseSettings, labels:
     state = _from_keypoints(measurements, settings, labels)
     change = _change_of_lengths(measurements, state)
     of_ends = _of_ends(measurements)
-    if change < _RIGID or of_ends is None:
+    if of_ends is None or change < (_RIGID if measurements.num_cameras > 2 else _RIGID_OF_TWO):
         return state
     try:
         start = _from_keypoints(of_ends, settings, labels)
