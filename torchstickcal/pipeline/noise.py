@@ -264,9 +264,16 @@ class _Levels:
     @cached_property
     def _correlation(self) -> ErrorCorrelation:
         gates = None if self._held is None else self._held.correlation
-        found = error_correlation(self._kept, self._state, self.sigma_px, _CONTRAST, gates)
+        found = correlation_for_weights(self._kept, self._state, self.sigma_px, gates)
         self.gates = found.gates
         return found
+
+
+def correlation_for_weights(
+    kept: Measurements, state: State, sigma_px: Tensor, gates: CorrelationGates | None = None
+) -> ErrorCorrelation:
+    """How long errors last, for the weights of the points; arguments as of :func:`error_correlation`."""
+    return error_correlation(kept, state, sigma_px, _CONTRAST, gates)
 
 
 def check_noise(config: Config, points: int) -> None:

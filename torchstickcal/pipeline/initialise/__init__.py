@@ -29,8 +29,8 @@ __all__ = ["initialise", "triangulated"]
 _SUPPORT_SCALE = 10.0
 """Scale of the robust kernels in units of the inlier threshold of RANSAC."""
 _RIGID, _RIGID_OF_TWO = 0.02, 0.01
-"""Change of a stick's length, as a share of it, below which the start is near enough; with two cameras, no third view shows that
-it is not. Sound starts have 0.002 to 0.015, and more only among many outliers."""
+"""Change of a stick's length, as a share of it, below which the start is near enough; with two cameras, no third view shows
+that it is not. Sound starts have 0.002 to 0.015, and more only among many outliers."""
 _CLEARLY_LESS, _AS_GOOD = 0.5, 4.0
 """Change of the lengths and squared residual from the ends alone, relative to those from all keypoints, up to which the ends
 are the start."""
