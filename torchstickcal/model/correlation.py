@@ -150,8 +150,10 @@ def error_correlation(
         nothing = None
     else:
         nothing = gates.nothing
-    independent = 2 * free * m.by_frame(m.visible.sum(1)).sum(1) / time.clamp_max(m.frames)
-    amplitudes, nothing = _amplitudes(products, pairs, common, independent, contrast, nothing)
+    numbers = 2 * free * m.by_frame(m.visible.sum(1)).sum(1)
+    lasting = 1 + (time - 1) / common.amax(1, keepdim=True).clamp_min(1e-12)
+    counts = (numbers / time.clamp_max(m.frames), numbers / lasting.clamp_max(m.frames))
+    amplitudes, nothing = _amplitudes(products, pairs, common, *counts, contrast, nothing)
     values[..., 1:] = (amplitudes[..., None] * common[:, None]).clamp(0.0, 1.0)[..., bins]
     return ErrorCorrelation(values, CorrelationGates(significant, nothing))
 
@@ -245,7 +247,13 @@ def _pooled(products: Tensor, pairs: Tensor, widths: Tensor, held: Tensor | None
 
 
 def _amplitudes(
-    products: Tensor, pairs: Tensor, common: Tensor, independent: Tensor, contrast: float, nothing: Tensor | None
+    products: Tensor,
+    pairs: Tensor,
+    common: Tensor,
+    independent: Tensor,
+    independent_lasting: Tensor,
+    contrast: float,
+    nothing: Tensor | None,
 ) -> tuple[Tensor, Tensor]:
     """How much of the common correlation (B, bins) each point has, (B, P), drawn towards that of all points; and who has none.
 
@@ -258,6 +266,7 @@ def _amplitudes(
         pairs: their numbers, as far as they are independent, (B, P, bins).
         common: the correlation of all points together.
         independent: (B, P), number of independent errors that each point has had.
+        independent_lasting: (B, P), the same of what lasts of them.
         contrast: variance of the logarithms between points that is taken for granted.
         nothing: (B, P), the points that have none; None to decide.
     """
@@ -268,6 +277,8 @@ def _amplitudes(
     if nothing is None:
         nothing = (own < least) & (least < (-_SIGNIFICANT_OF_POINT * scatter.sqrt()).exp())
     own = torch.maximum(own, least).clamp_max(_LARGEST_AMPLITUDE)
-    sampling = by_chance / own.square() + scatter
-    drawn = shrunk_logarithms(own.log(), sampling, independent > 0, contrast, _FARTHEST).exp()
+    half = independent_lasting.clamp_min(1.0) / 2  # degrees of freedom of a variance, whose logarithm is too small in the mean
+    sampling = by_chance / own.square() + torch.polygamma(1, half)
+    logarithms = own.log() - (torch.digamma(half) - half.log())
+    drawn = shrunk_logarithms(logarithms, sampling, independent > 0, contrast, _FARTHEST).exp()
     return drawn.where(~nothing, _MEAN_BY_CHANCE * by_chance.sqrt()), nothing
