@@ -142,7 +142,8 @@ def error_correlation(
     free = _freedom_share(m)
     products, pairs = free[..., None] * products, free[..., None] * pairs
     held = None if gates is None else gates.significant
-    common, time, significant = _pooled(products.sum(1), pairs.sum(1), bins.bincount(), held)
+    widths = bins.bincount()
+    common, time, significant = _pooled(products.sum(1), pairs.sum(1), widths, held)
     if gates is None:
         gates = CorrelationGates(significant, torch.zeros_like(values[..., 0], dtype=torch.bool))
         if not bool(significant.any()):
@@ -151,7 +152,8 @@ def error_correlation(
     else:
         nothing = gates.nothing
     numbers = 2 * free * m.by_frame(m.visible.sum(1)).sum(1)
-    lasting = 1 + (time - 1) / common.amax(1, keepdim=True).clamp_min(1e-12)
+    squares = (common.square() * widths).sum(1, keepdim=True)
+    lasting = 1 + 2 * (common * widths).sum(1, keepdim=True).square() / squares.clamp_min(1e-12)
     counts = (numbers / time.clamp_max(m.frames), numbers / lasting.clamp_max(m.frames))
     amplitudes, nothing = _amplitudes(products, pairs, common, *counts, contrast, nothing)
     values[..., 1:] = (amplitudes[..., None] * common[:, None]).clamp(0.0, 1.0)[..., bins]
