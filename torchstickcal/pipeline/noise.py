@@ -124,7 +124,7 @@ class StageNoise:
         return near() if rejects is None else Chosen(kept.visible, rejects)
 
     def decided(
-        self, kept: Measurements, state: State, squared_residuals: Tensor, chosen: Chosen
+        self, kept: Measurements, state: State, squared_residuals: Tensor, chosen: Chosen, times: Tensor | None = None
     ) -> tuple[dict[str, Loss], NoiseLevels, NoiseGates]:
         """The stage's losses at a state, their noise, and what was decided about it.
 
@@ -133,8 +133,10 @@ class StageNoise:
             state: where the errors are looked at.
             squared_residuals: of all keypoints at the state.
             chosen: the keypoints from which their noise is estimated.
+            times: (B, P), as many keypoints of each point as count as one where the stage estimates that; NaN where it is to be
+                estimated, None for all.
         """
-        found = _Levels(kept, state, chosen.sigma_px(kept, squared_residuals))
+        found = _Levels(kept, state, chosen.sigma_px(kept, squared_residuals), times=times)
         losses = self._losses(kept, found.sigma_px, found.correlation_frames, found.acceleration_m)
         return losses, found.levels, NoiseGates(chosen, found.gates)
 
@@ -232,14 +234,21 @@ class HeldNoise:
 class _Levels:
     """Estimates the levels that losses ask for while they are built, each at most once."""
 
-    def __init__(self, kept: Measurements, state: State, sigma_px: Tensor, held: NoiseGates | None = None) -> None:
-        self._kept, self._state, self._held = kept, state, held
+    def __init__(
+        self,
+        kept: Measurements,
+        state: State,
+        sigma_px: Tensor,
+        held: NoiseGates | None = None,
+        times: Tensor | None = None,
+    ) -> None:
+        self._kept, self._state, self._held, self._times = kept, state, held, times
         self.sigma_px = sigma_px
         self.levels = NoiseLevels(sigma_px, torch.ones_like(sigma_px), torch.full_like(sigma_px, torch.inf))
         self.gates: CorrelationGates | None = None
 
     def correlation_frames(self, given: float | str) -> Tensor:
-        times = self._correlation.times if given == _ESTIMATED else torch.full_like(self.sigma_px, float(given))
+        times = self._estimated_times if given == _ESTIMATED else torch.full_like(self.sigma_px, float(given))
         self.levels = self.levels._replace(correlation_frames=times)
         return times
 
@@ -255,12 +264,27 @@ class _Levels:
         self.levels = self.levels._replace(acceleration_m=acceleration_m)
         return acceleration_m
 
+    @property
+    def _estimated_times(self) -> Tensor:
+        times = self._times
+        if times is None:
+            return self._correlation.times
+        unknown = times.isnan()
+        return torch.where(unknown, self._correlation.times, times) if bool(unknown.any()) else times
+
     @cached_property
     def _correlation(self) -> ErrorCorrelation:
         gates = None if self._held is None else self._held.correlation
-        found = error_correlation(self._kept, self._state, self.sigma_px, _CONTRAST, gates)
+        found = correlation_for_weights(self._kept, self._state, self.sigma_px, gates)
         self.gates = found.gates
         return found
+
+
+def correlation_for_weights(
+    kept: Measurements, state: State, sigma_px: Tensor, gates: CorrelationGates | None = None
+) -> ErrorCorrelation:
+    """How long errors last, for the weights of the points; arguments as of :func:`error_correlation`."""
+    return error_correlation(kept, state, sigma_px, _CONTRAST, gates)
 
 
 def check_noise(config: Config, points: int) -> None:

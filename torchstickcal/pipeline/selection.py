@@ -7,6 +7,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
 
+import torch
 from torch import Tensor
 
 from torchstickcal.errors import ObservationError, RigError
@@ -25,6 +26,7 @@ from torchstickcal.pipeline.adjust import (
 from torchstickcal.pipeline.check import CameraCheck
 from torchstickcal.pipeline.run import Run
 from torchstickcal.pipeline.synchronise import ClockEstimate, clocks_unlike_given, on_common_frames, search_offsets
+from torchstickcal.quality.handedness import MIRRORED_SHARE, mirrored_share
 
 _MAX_STARTS = 3
 _MOST_TRIALS = 3
@@ -40,8 +42,9 @@ _FITTING_SHARE, _FITTING_FOCAL_SHARE = 0.6, 0.01
 """Least fraction of inliers, and largest noise as a fraction of the focal length, of cameras that fit together."""
 _CLEAR_SHARE, _CLEAR_FOCAL_SHARE = 0.8, 0.003
 """The same of cameras that were started from given poses and need no comparison with cameras that were not."""
-_CLEARLY_LESS = 0.5
-"""Squared residual, relative to another, from which on it is clearly less."""
+_CLEARLY_LESS, _LESS = 0.5, 0.9
+"""Squared residual, relative to another, from which on it is clearly less; and the same where something else speaks against the
+other."""
 
 
 class ModelSelection:
@@ -112,8 +115,22 @@ class ModelSelection:
         found, clocks = self._found(clocks, first)
         if self._start is not None and not any(_fits(one, _CLEAR_SHARE, _CLEAR_FOCAL_SHARE) for one in found):
             found, clocks = self._without_start(found, clocks)
-        best = min(found, key=_median_squared_residual)
+        best = self._turned_back(min(found, key=_median_squared_residual))
         return best if set(self.named) <= set(best.refined) else self._with(best, self.named), clocks
+
+    def _turned_back(self, found: Adjustment) -> Adjustment:
+        """What was found or, where the athlete's right side is on the left in it, what is found from reversed depths.
+
+        The latter only if it fits better, which it does not where the videos are mirrored.
+        """
+        m, names = found.measurements, found.observations[0].point_names
+        points = m.by_frame(found.state.points[0].where(found.kept.active[0], torch.nan))
+        if mirrored_share(points, names) <= MIRRORED_SHARE:
+            return found
+        reverse = replace(found[0], state=found.state.depth_reversed(m.active))
+        other = self._at_nearest_frames(adjust_cameras(reverse, self._run))
+        better = _median_squared_residual(other) < _LESS * _median_squared_residual(found)
+        return other if better and other.converged else found
 
     def _without_start(
         self, found: list[Adjustment], clocks: ClockEstimate | None

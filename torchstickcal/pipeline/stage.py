@@ -94,6 +94,7 @@ def run_stage(
     state: State,
     run: Run,
     least: float = 0.0,
+    times: Tensor | None = None,
 ) -> StageResult:
     """Run one stage from a state, for all sessions.
 
@@ -105,6 +106,8 @@ def run_stage(
         run: what all steps share.
         least: relative decrease of the cost from which on Gauss-Newton is near enough to the minimum, because Newton's method
             follows; 0 where it does not.
+        times: (B, P), as many keypoints of each point as count as one where the stage estimates that; NaN where it is to be
+            estimated, None for all.
 
     Raises:
         CalibrationError: if it does not converge in a session, and the run must.
@@ -124,7 +127,7 @@ def run_stage(
             state, squared_residuals = found, measurements.squared_residuals(found)
     noise = run.noise_of(stage)
     chosen = near if stage.cameras == "free" else noise.chosen(measurements, lambda: near)
-    losses, levels, gates = noise.decided(measurements, state, squared_residuals, chosen)
+    losses, levels, gates = noise.decided(measurements, state, squared_residuals, chosen, times)
     del squared_residuals
     objective = Objective(measurements, losses)
     least = least if run.config.solver == "gauss_newton" else 0.0

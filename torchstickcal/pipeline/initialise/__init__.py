@@ -1,16 +1,24 @@
-"""Initialisation of the rig from keypoints alone, as in the paper: relative poses of pairs, spanning tree, triangulation."""
+"""Initialisation of the rig from keypoints alone, as in the paper: relative poses of pairs, spanning tree, triangulation.
+
+A detector may place joints differently in different views, always in the same way. In a wrong scene such keypoints can fit
+together; but a stick is not equally long in all frames of it. Where it is not, the ends of the sticks alone are the start, if
+the sticks keep their lengths then.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from functools import partial
 
 import torch
 from torch import Tensor
 
 from torchstickcal.config import InitialiseSettings
+from torchstickcal.errors import RigError
 from torchstickcal.geometry.triangulation import triangulate_robustly
 from torchstickcal.model.measurements import Measurements
+from torchstickcal.model.ranks import nanquantile
 from torchstickcal.model.state import State
 from torchstickcal.pipeline.initialise.graph import propagate, spanning_tree
 from torchstickcal.pipeline.initialise.pairs import relate
@@ -20,6 +28,12 @@ __all__ = ["initialise", "triangulated"]
 
 _SUPPORT_SCALE = 10.0
 """Scale of the robust kernels in units of the inlier threshold of RANSAC."""
+_RIGID, _RIGID_OF_TWO = 0.02, 0.01
+"""Change of a stick's length, as a share of it, below which the start is near enough; with two cameras, no third view shows
+that it is not. Sound starts have 0.002 to 0.015, and more only among many outliers."""
+_CLEARLY_LESS, _AS_GOOD = 0.5, 4.0
+"""Change of the lengths and squared residual from the ends alone, relative to those from all keypoints, up to which the ends
+are the start."""
 
 
 def initialise(measurements: Measurements, settings: InitialiseSettings, labels: Sequence[str]) -> State:
@@ -33,12 +47,49 @@ def initialise(measurements: Measurements, settings: InitialiseSettings, labels:
     Raises:
         RigError: if the cameras do not have enough common points.
     """
+    state = _from_keypoints(measurements, settings, labels)
+    change = _change_of_lengths(measurements, state)
+    of_ends = _of_ends(measurements)
+    if of_ends is None or change < (_RIGID if measurements.num_cameras > 2 else _RIGID_OF_TWO):
+        return state
+    try:
+        start = _from_keypoints(of_ends, settings, labels)
+    except RigError:
+        return state
+    other = replace(start, points=triangulated(measurements, start.rotations, start.translations, settings))
+    rigid = _change_of_lengths(measurements, other) < _CLEARLY_LESS * change
+    return other if rigid and _misfit(measurements, other) < _AS_GOOD * _misfit(measurements, state) else state
+
+
+def _from_keypoints(measurements: Measurements, settings: InitialiseSettings, labels: Sequence[str]) -> State:
+    """Cameras and points by all the keypoints; arguments and errors as of :func:`initialise`."""
     views = Views(measurements)
     relate_pair = partial(relate, views, max_points=settings.max_points, threshold_px=settings.threshold_px)
     edges = spanning_tree(views.common(), relate_pair, labels, settings.min_common_points)
     poses = propagate(edges, views, _kernel_scale(measurements, settings))
     rotations, translations = (torch.from_numpy(pose)[None].to(measurements.pixels.device) for pose in poses)
     return State.of(rotations, translations, triangulated(measurements, rotations, translations, settings, views))
+
+
+def _of_ends(measurements: Measurements) -> Measurements | None:
+    """The keypoints of the ends of the sticks; None where there are no sticks, or no other points."""
+    ends = torch.zeros(measurements.points_per_frame, dtype=torch.bool, device=measurements.pixels.device)
+    ends[measurements.sticks.flatten()] = True
+    return measurements.keeping(ends.repeat(measurements.frames)) if bool(ends.any()) and not bool(ends.all()) else None
+
+
+def _change_of_lengths(measurements: Measurements, state: State) -> float:
+    """How much the length of a stick changes from frame to frame, as a share of it: the median. 0 without sticks."""
+    ends = measurements.by_frame(state.points)[0][:, :, measurements.sticks]
+    lengths = (ends[..., 1] - ends[..., 0]).norm(dim=0).where(measurements.stick_active[0], torch.nan)
+    change = (lengths / lengths.nanmedian(0).values - 1).abs().nanmedian()
+    return float(change.nan_to_num(0.0))
+
+
+def _misfit(measurements: Measurements, state: State) -> float:
+    """The lower quartile of the squared residuals, square pixels: few outliers are among them."""
+    squared = measurements.squared_residuals(state).double()
+    return float(nanquantile(squared.where(measurements.visible, torch.nan).flatten(1), 0.25))
 
 
 def triangulated(

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 
 import torch
 from torch import Tensor
 
 from torchstickcal.quality.evidence import Evidence
 from torchstickcal.quality.finding import Finding, Severity
+from torchstickcal.quality.handedness import MIRRORED_SHARE, mirrored_share
 from torchstickcal.quality.registry import findings
 
 _SEGMENTS = {("knee", "ankle"): 0.246, ("hip", "knee"): 0.245, ("shoulder", "elbow"): 0.186, ("elbow", "wrist"): 0.146}
@@ -19,7 +20,6 @@ _TALLEST_M, _SHORTEST_M = 2.4, 1.1
 wrong by up to 8 %."""
 _LEAST_FRAMES, _LEAST_LENGTHS = 15, 8
 """Frames in which a limb counts by itself, and lengths of all limbs together that count where no limb does."""
-_MIRRORED_SHARE = 0.8
 
 
 @findings("body", "the athlete's height, and left and right exchanged in space")
@@ -30,7 +30,7 @@ def body(evidence: Evidence) -> Iterator[Finding]:
         return
     places = {name: index for index, name in enumerate(names)}
     yield from _height(evidence, places)
-    yield from _mirrored(evidence, places)
+    yield from _mirrored(evidence)
 
 
 def height_m(points: Tensor, places: dict[str, int]) -> float | None:
@@ -71,44 +71,10 @@ def _height(evidence: Evidence, places: dict[str, int]) -> Iterator[Finding]:
     )
 
 
-def _mirrored(evidence: Evidence, places: dict[str, int]) -> Iterator[Finding]:
-    """A scene that is its own mirror image: knees, elbows, nose and toes say where forward is."""
-    points = evidence.points
-
-    def at(name: str) -> Tensor | None:
-        return points[..., places[name]] if name in places else None
-
-    def middle(candidates: Sequence[str]) -> Tensor | None:
-        known = [place for name in candidates if (place := at(name)) is not None]
-        return torch.stack(known).mean(0) if known else None
-
-    shoulders = at("left_shoulder"), at("right_shoulder")
-    low = middle(["left_hip", "right_hip"])
-    low = low if low is not None else middle(["pelvis", "hip"])
-    if shoulders[0] is None or shoulders[1] is None or low is None:
-        return
-    right = shoulders[1] - shoulders[0]
-    up = (shoulders[0] + shoulders[1]) / 2 - low
-    forward = torch.zeros_like(up)
-    for side in ("left", "right"):
-        hip = at(f"{side}_hip")
-        hip = hip if hip is not None else low
-        knee, ankle = at(f"{side}_knee"), at(f"{side}_ankle")
-        if knee is not None and ankle is not None:
-            forward = forward + (knee - (hip + ankle) / 2).nan_to_num()
-        toe, heel = at(f"{side}_big_toe"), at(f"{side}_heel")
-        if toe is not None and heel is not None:
-            forward = forward + (toe - heel).nan_to_num()
-    nose, ears = at("nose"), middle(["left_ear", "right_ear"])
-    if nose is not None and ears is not None:
-        forward = forward + 2 * (nose - ears).nan_to_num()
-    handed = (right * torch.linalg.cross(forward, up, dim=0)).sum(0)
-    size = right.norm(dim=0) * forward.norm(dim=0) * up.norm(dim=0)
-    clear = handed.isfinite() & (handed.abs() > 0.2 * size) & (size > 0)
-    if int(clear.sum()) < _LEAST_FRAMES:
-        return
-    share = float((handed[clear] < 0).double().mean())
-    if share > _MIRRORED_SHARE:
+def _mirrored(evidence: Evidence) -> Iterator[Finding]:
+    """A scene that is its own mirror image."""
+    share = mirrored_share(evidence.points, evidence.observations.point_names)
+    if share > MIRRORED_SHARE:
         yield Finding(
             "scene_mirrored",
             Severity.SERIOUS,
@@ -116,7 +82,7 @@ def _mirrored(evidence: Evidence, places: dict[str, int]) -> Iterator[Finding]:
             "rig is its own mirror image, or the names of left and right are exchanged.",
             "Mirror the keypoints of all cameras, x to width - 1 - x, or exchange the names.",
             figure=share,
-            limit=_MIRRORED_SHARE,
+            limit=MIRRORED_SHARE,
             unit="share",
             is_cause=evidence.consistent,
         )
