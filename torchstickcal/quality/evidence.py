@@ -47,6 +47,9 @@ _LEAST_FRAMES = 20
 _OTHER_PERSON_SHARE = 0.2
 """Share of a camera's frames that were set aside as those of another person, from which on the camera itself is doubted."""
 
+_RUN_SHARE, _LEAST_RUN_SHARE = 0.9, 0.1
+"""Share of the frames that were set aside, and least share of all frames, that is one run at an end of the session."""
+
 
 @dataclass(frozen=True)
 class Evidence:
@@ -140,6 +143,16 @@ class Evidence:
     def doubtful(self) -> Tensor:
         """(C,), whether clearly fewer keypoints of a camera agree than of the others."""
         return (self.agreement < DOUBTFUL_SHARE) & (self.agreement < _BEHIND_OTHERS * self.agreement.median())
+
+    @cached_property
+    def set_aside_at_end(self) -> Tensor:
+        """(C,), whether frames of a camera that were set aside as those of another person are the first or the last of the
+        session: so they are where the camera moved far."""
+        other = self.ended.labels.other_person[0]
+        count, frames = other.sum(1, keepdim=True), torch.arange(other.shape[1], device=other.device)
+        runs = torch.stack([frames < count, frames >= other.shape[1] - count])
+        at_end = (runs & other).sum(-1).amax(0) > _RUN_SHARE * count[:, 0]
+        return at_end & (count[:, 0] >= _LEAST_RUN_SHARE * other.shape[1])
 
     @cached_property
     def in_common(self) -> Tensor:

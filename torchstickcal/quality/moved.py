@@ -32,8 +32,8 @@ _EDGE = 0.04
 _BLOCKS = (12, 24, 48)
 """Numbers of blocks of frames from whose scatter the variance is estimated."""
 _LEAST_VARIANCE = 0.4
-"""Least variance of the pulls, over that of independent errors. The robust kernel makes it 0.55; of keypoints without noise only
-rounding errors are left."""
+"""Least variance of the pulls, over that of independent errors. The robust kernel makes it 0.55; of keypoints without noise
+only rounding errors are left."""
 _CERTAIN = 0.95
 _NOT_A_TURN = 11.3
 """Evidence that a change has beyond a turn of the camera, from which on it was no turn: three more numbers have less by chance
