@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
@@ -49,6 +50,8 @@ _OTHER_PERSON_SHARE = 0.2
 
 _RUN_SHARE, _LEAST_RUN_SHARE = 0.9, 0.1
 """Share of the frames that were set aside, and least share of all frames, that is one run at an end of the session."""
+_LEAST_PARALLAX_DEG = 3.0
+"""Angle between two rays below which the depth of a point is hardly known."""
 
 
 @dataclass(frozen=True)
@@ -234,6 +237,13 @@ class Evidence:
         return self.measurements.by_frame(self.state.points[0].where(known, torch.nan))
 
     @cached_property
+    def points_with_depth(self) -> Tensor:
+        """(3, F, P), those of :attr:`points` whose distance from the cameras is known; NaN elsewhere."""
+        m = self.kept
+        unknown = without_depth(self.state.points[0], self.centres.to(self.state.points), m.visible[0])
+        return self.points.masked_fill(m.by_frame(unknown), torch.nan)
+
+    @cached_property
     def constant_errors_px(self) -> Tensor:
         """(C, 2, P), mean residual of each point in each camera, pixels; 0 where it is seen in too few frames to tell."""
         m = self.kept
@@ -325,3 +335,18 @@ class Evidence:
     def acceptance(self) -> Acceptance | None:
         """Errors in millimetres; None where nothing can be tested."""
         return accepted(self.ended, self.noise, self.ruler)
+
+
+def without_depth(points: Tensor, centres: Tensor, seen: Tensor) -> Tensor:
+    """Which points (N,) cameras see from nearly one place, so that nothing is known of how far away they are.
+
+    Args:
+        points: (3, N), metres.
+        centres: of the cameras, (C, 3).
+        seen: which camera sees which point, (C, N).
+    """
+    mean = torch.zeros_like(points)
+    for centre, own in zip(centres, seen, strict=True):
+        mean += torch.nn.functional.normalize(points - centre[:, None], dim=0) * own
+    length = mean.norm(dim=0) / seen.sum(0).clamp_min(1)
+    return length > math.cos(math.radians(_LEAST_PARALLAX_DEG / 2))

@@ -35,9 +35,9 @@ def _judged(evidence: Evidence) -> Quality:
     causes: list[Finding] = []
     if _worth_trying(evidence, found):
         causes = [finding for family in FAMILIES.values() if family.tries for finding in _findings(family, evidence)]
-    if causes:
-        return Quality.of([*causes, *_as_effects(found)], _acceptance(evidence))
-    return Quality.of([*large, *small], _acceptance(evidence))
+    if any(finding.is_cause for finding in causes):
+        large = list(_as_effects(found))
+    return Quality.of([*causes, *large, *([] if causes else small)], _acceptance(evidence))
 
 
 def _worth_trying(evidence: Evidence, found: dict[Family, list[Finding]]) -> bool:

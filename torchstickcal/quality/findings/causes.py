@@ -99,18 +99,17 @@ def _explained(evidence: Evidence, camera: int, rest: Rest, agreement: float) ->
     plain = rest.placed(sight)
     as_given = 0.0 if plain is None else plain[0].share
 
-    def cause(code: str, what: str, advice: str, share: float, frames: tuple[int, int] | None = None) -> Finding:
+    def cause(code: str, what: str, advice: str, share: float, is_cause: bool = True) -> Finding:
         return Finding(
             code,
             Severity.SERIOUS,
             f"{name}: {what} ({100 * share:.0f} % of them; {100 * as_given:.0f} % as given).",
             advice,
             cameras=(name,),
-            frames=frames,
             figure=share,
             limit=_SOUND_SHARE,
             unit="share",
-            is_cause=True,
+            is_cause=is_cause,
         )
 
     found = [(h, placed[0]) for h in hypotheses() if (placed := rest.placed(h.changed(sight))) is not None]
@@ -132,6 +131,7 @@ def _explained(evidence: Evidence, camera: int, rest: Rest, agreement: float) ->
             "its keypoints agree with the other cameras at another place than the one that was found",
             "Calibrate the other cameras first, or give a session in which this camera shares more with them.",
             as_given,
+            is_cause=False,
         )
     later, share = shifted_share(rest, sight, evidence.ended.frames[0].rate_hz)
     if later and share > max(_SOUND_SHARE, _IN_TIME_SHARE * rest.share, as_given + _GAIN):
