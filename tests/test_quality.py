@@ -22,13 +22,15 @@ from torchstickcal.errors import ObservationError
 from torchstickcal.geometry import se3
 from torchstickcal.io import load_session, write_npz
 from torchstickcal.model.unknowns import all_unknowns
-from torchstickcal.quality.evidence import Evidence
-from torchstickcal.quality.findings.unknowns import _contradicted, _little_in_common
+from torchstickcal.quality.evidence import Evidence, without_depth
+from torchstickcal.quality.findings.causes import _closer
+from torchstickcal.quality.findings.unknowns import _contradicted, _different, _little_in_common
+from torchstickcal.quality.judge import _as_effects
 from torchstickcal.quality.lags import frames_are_apart
 from torchstickcal.quality.linear import FramePulls
 from torchstickcal.quality.moved import motion_of
-from torchstickcal.quality.registry import FAMILIES, findings
-from torchstickcal.quality.resection import resected
+from torchstickcal.quality.registry import FAMILIES, Family, findings
+from torchstickcal.quality.resection import Resection, resected
 from torchstickcal.quality.trials import without
 from torchstickcal.result import CameraParameter
 from torchstickcal.simulate import Noise, SessionSpec, SimulatedSession, golf_session
@@ -286,6 +288,99 @@ def test_errors_that_last_are_no_motion_of_a_camera(seed: int):
     assert "camera_moved" not in codes(calibration.quality)
 
 
+@pytest.mark.parametrize(("camera", "first", "turn_deg"), [(2, 11, 4.0), (1, 14, 3.0)])
+def test_a_camera_that_moved_far_near_an_end_is_no_other_person(camera: int, first: int, turn_deg: float):
+    """All its keypoints contradict the others on one side of the move, and are set aside."""
+    calibration = calibrate(knocked(session(), camera, first, turn_deg, 0.0))
+    assert int(calibration.other_person[camera].sum()) >= first - 2
+    found = calibration.quality.findings[0]
+    assert (found.code, found.cameras) == ("camera_moved", (f"cam{camera + 1:02d}",))
+    assert found.frames is not None
+    assert abs(found.frames[0] - first) <= 2
+
+
+@pytest.mark.parametrize(
+    ("share", "at_start", "at_end"), [(0.5, True, False), (0.2, False, True), (0.05, True, False), (0.3, False, False)]
+)
+def test_frames_set_aside_at_an_end(share: float, at_start: bool, at_end: bool):
+    evidence = evidence_of(calibrate(session(cameras=3, frames=20).observations))
+    other = torch.zeros(1, 3, 20, dtype=torch.bool)
+    count = round(share * 20)
+    first = 0 if at_start else 20 - count if at_end else 7
+    other[0, 1, first : first + count] = True
+    labels = replace(evidence.ended.labels, other_person=other)
+    changed = replace(evidence, ended=replace(evidence.ended, labels=labels))
+    assert changed.set_aside_at_end.tolist() == [False, (at_start or at_end) and share >= 0.1, False]
+
+
+@pytest.mark.parametrize(
+    ("shares", "distances", "closer"),
+    [((0.97, 0.96), (1.4, 1.3), True), ((0.97, 0.96), (1.4, 3.3), False), ((0.97, 0.8), (1.4, 1.3), False)],
+)
+def test_two_places_are_compared_with_another_explanation(
+    shares: tuple[float, float], distances: tuple[float, float], closer: bool
+):
+    """A camera that moved agrees as often with intrinsics of another resolution, but less closely."""
+
+    def placed(share: float, distance_sigmas: float) -> Resection:
+        agreeing = torch.arange(100) < 100 * share
+        return Resection(torch.eye(3), torch.zeros(3), agreeing, torch.eye(6), distance_sigmas)
+
+    assert _closer([placed(*one) for one in zip(shares, distances, strict=True)], placed(0.95, 3.5)) is closer
+
+
+@pytest.mark.parametrize(("direct", "severity"), [(False, Severity.FATAL), (True, Severity.FATAL), (False, Severity.SERIOUS)])
+def test_what_is_fatal_is_an_effect_of_the_cause_that_a_trial_found(direct: bool, severity: Severity):
+    look = FAMILIES["agreement"].look
+    family = Family("large", look, direct=direct)
+    found = {
+        family: [Finding("large", severity, ".", is_cause=True)],
+        Family("s", look, small=True): [Finding("s", severity, ".")],
+    }
+    (left,) = _as_effects(found)
+    assert left.is_cause is (direct or severity < Severity.FATAL)
+
+
+@pytest.mark.parametrize(("angles", "unknown"), [((0.0, 1.0), True), ((0.0, 8.0), False), ((0.0, 1.0, 90.0), False)])
+def test_points_seen_from_one_place_have_no_depth(angles: tuple[float, ...], unknown: bool):
+    at = torch.tensor(angles, dtype=torch.float64).deg2rad()
+    centres = 4 * torch.stack([at.cos(), at.sin(), 0 * at], dim=1)
+    points = torch.tensor([[0.0], [0.0], [0.3]]).double().expand(3, 2)
+    seen = torch.ones(len(at), 2, dtype=torch.bool)
+    seen[2:, 1] = False  # the second point, by the first two cameras only
+    assert without_depth(points, centres, seen).tolist() == [unknown, angles[1] < 3]
+
+
+@pytest.mark.parametrize(
+    ("offset_px", "estimate", "severity"),
+    [(-60.0, 1.18, Severity.SERIOUS), (-60.0, 1.05, None), (-100.0, 1.0, Severity.CAUTION)],
+)
+def test_a_principal_point_beside_a_focal_length_far_off(offset_px: float, estimate: float, severity: Severity | None):
+    """A focal length that is estimated takes up most of what a principal point explains."""
+    given, at = torch.full((3,), 1200.0).double(), torch.tensor([[960.0, 540.0]]).double().expand(3, 2)
+    suggested = at + torch.tensor([[0.0, 0.0], [offset_px, 0.0], [0.0, 0.0]])
+    std = torch.full_like(at, 10.0)
+    unknowns = {
+        "focal": CameraParameter(
+            *("focal length", "px", ("focal",), True), given * torch.tensor([1.0, estimate, 1.0]), given, given, given,
+            (given, given),
+        ),
+        "principal_point": CameraParameter(
+            *("principal point", "px", ("x", "y"), False), at, at, at, torch.full_like(at, 24.0), (suggested, std)
+        ),
+    }  # fmt: skip
+    evidence = SimpleNamespace(
+        observations=session(cameras=3, frames=2).observations,
+        unknowns=unknowns,
+        contradictions={"principal_point": ((suggested - at) / std).square().sum(1)},
+        camera=lambda camera: f"cam{camera}",
+        explains_most=lambda family: True,
+    )
+    unknown = all_unknowns()["principal_point"]
+    found = [finding.severity for finding in _different(cast(Evidence, evidence), unknown, unknowns["principal_point"])]
+    assert found == ([] if severity is None else [severity])
+
+
 def test_a_camera_that_rolled_is_found():
     """About its axis, which moves no image as a whole."""
     given = session(frames=60)
@@ -311,7 +406,7 @@ def test_pulls_are_the_reduced_camera_system_frame_by_frame():
     from torchstickcal.losses.robust import GemanMcClure
     from torchstickcal.model.objective import Objective
 
-    loss = ReprojectionLoss(evidence.ended.last.sigma_px[:, None, None], kernel=GemanMcClure(6.0))
+    loss = ReprojectionLoss(evidence.ended.last.sigma_px[:, None, None], kernel=GemanMcClure(4.0))
     system = NormalEquations(Objective(evidence.kept, {"reprojection": loss}), evidence.state, cameras_free=True)
     torch.testing.assert_close(pulls.information.sum(0)[6:, 6:], system.reduced[0])
     torch.testing.assert_close(pulls.gradient.sum(0)[1:].flatten(), system.reduced_gradient[0], rtol=1e-6, atol=1e-6)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
@@ -47,6 +48,11 @@ _LEAST_FRAMES = 20
 """Least number of frames in which a camera sees a point, for the mean of its errors to be known."""
 _OTHER_PERSON_SHARE = 0.2
 """Share of a camera's frames that were set aside as those of another person, from which on the camera itself is doubted."""
+
+_RUN_SHARE, _LEAST_RUN_SHARE = 0.9, 0.1
+"""Share of the frames that were set aside, and least share of all frames, that is one run at an end of the session."""
+_LEAST_PARALLAX_DEG = 3.0
+"""Angle between two rays below which the depth of a point is hardly known."""
 
 
 @dataclass(frozen=True)
@@ -143,6 +149,16 @@ class Evidence:
         return (self.agreement < DOUBTFUL_SHARE) & (self.agreement < _BEHIND_OTHERS * self.agreement.median())
 
     @cached_property
+    def set_aside_at_end(self) -> Tensor:
+        """(C,), whether frames of a camera that were set aside as those of another person are the first or the last of the
+        session: so they are where the camera moved far."""
+        other = self.ended.labels.other_person[0]
+        count, frames = other.sum(1, keepdim=True), torch.arange(other.shape[1], device=other.device)
+        runs = torch.stack([frames < count, frames >= other.shape[1] - count])
+        at_end = (runs & other).sum(-1).amax(0) > _RUN_SHARE * count[:, 0]
+        return at_end & (count[:, 0] >= _LEAST_RUN_SHARE * other.shape[1])
+
+    @cached_property
     def in_common(self) -> Tensor:
         """(C,), share of each camera's keypoints that another camera sees at the same time; 1 where it has none. Of a camera
         that has more than others, as many count."""
@@ -222,6 +238,13 @@ class Evidence:
         """(3, F, P), metres; NaN where a point is not known."""
         known = self.kept.active[0]
         return self.measurements.by_frame(self.state.points[0].where(known, torch.nan))
+
+    @cached_property
+    def points_with_depth(self) -> Tensor:
+        """(3, F, P), those of :attr:`points` whose distance from the cameras is known; NaN elsewhere."""
+        m = self.kept
+        unknown = without_depth(self.state.points[0], self.centres.to(self.state.points), m.visible[0])
+        return self.points.masked_fill(m.by_frame(unknown), torch.nan)
 
     @cached_property
     def constant_errors_px(self) -> Tensor:
@@ -319,3 +342,18 @@ class Evidence:
     def acceptance(self) -> Acceptance | None:
         """Errors in millimetres; None where nothing can be tested."""
         return accepted(self.ended, self.noise, self.ruler)
+
+
+def without_depth(points: Tensor, centres: Tensor, seen: Tensor) -> Tensor:
+    """Which points (N,) cameras see from nearly one place, so that nothing is known of how far away they are.
+
+    Args:
+        points: (3, N), metres.
+        centres: of the cameras, (C, 3).
+        seen: which camera sees which point, (C, N).
+    """
+    mean = torch.zeros_like(points)
+    for centre, own in zip(centres, seen, strict=True):
+        mean += torch.nn.functional.normalize(points - centre[:, None], dim=0) * own
+    length = mean.norm(dim=0) / seen.sum(0).clamp_min(1)
+    return length > math.cos(math.radians(_LEAST_PARALLAX_DEG / 2))

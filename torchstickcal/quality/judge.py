@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import replace
 
 import torch
@@ -34,12 +35,14 @@ def _judged(evidence: Evidence) -> Quality:
     causes: list[Finding] = []
     if _worth_trying(evidence, found):
         causes = [finding for family in FAMILIES.values() if family.tries for finding in _findings(family, evidence)]
+    if any(finding.is_cause for finding in causes):
+        large = list(_as_effects(found))
     return Quality.of([*causes, *large, *([] if causes else small)], _acceptance(evidence))
 
 
 def _worth_trying(evidence: Evidence, found: dict[Family, list[Finding]]) -> bool:
     """Whether something is wrong, or may be, that no finding explains."""
-    if bool(evidence.off_centre.any()):
+    if bool((evidence.off_centre | evidence.set_aside_at_end).any()):
         return True
     every = [finding for own in found.values() for finding in own]
     wrong = any(finding.severity >= Severity.SERIOUS or finding.code == "camera_doubtful" for finding in every)
@@ -49,6 +52,14 @@ def _worth_trying(evidence: Evidence, found: dict[Family, list[Finding]]) -> boo
     alone = len(serious) < 2 and evidence.noise_mrad < _NOISY_MRAD
     explained = any(family.direct or (alone and (evidence.consistent or not family.small)) for family in explaining)
     return wrong and not explained
+
+
+def _as_effects(found: dict[Family, list[Finding]]) -> Iterator[Finding]:
+    """What is found beside a cause that a trial found: no small errors, and what is fatal is an effect of this cause, unless it
+    follows from what was given."""
+    for family, own in found.items():
+        for finding in own if not family.small else ():
+            yield finding if family.direct or finding.severity < Severity.FATAL else _as_effect(finding)
 
 
 def _as_effect(finding: Finding) -> Finding:

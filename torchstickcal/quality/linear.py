@@ -23,7 +23,7 @@ from torchstickcal.solvers.elimination.cross_blocks import cross_rows
 
 _MOST_PARTS = 400
 """Parts of a session of which the information is kept apart. Longer sessions have several frames in a part."""
-_KERNEL_SIGMAS = 6.0
+_KERNEL_SIGMAS = 4.0
 """Scale of the robust kernel: wrong keypoints must not look like a motion, and those of a camera that moved should pull."""
 
 

@@ -31,9 +31,9 @@ _EDGE = 0.04
 """Share of a session at each end in which no change is looked for: too few frames speak for it."""
 _BLOCKS = (12, 24, 48)
 """Numbers of blocks of frames from whose scatter the variance is estimated."""
-_LEAST_VARIANCE = 0.6
-"""Least variance of the pulls, over that of independent errors. Robust noise makes it 0.7; of keypoints without noise only
-rounding errors are left."""
+_LEAST_VARIANCE = 0.4
+"""Least variance of the pulls, over that of independent errors. The robust kernel makes it 0.55; of keypoints without noise
+only rounding errors are left."""
 _CERTAIN = 0.95
 _NOT_A_TURN = 11.3
 """Evidence that a change has beyond a turn of the camera, from which on it was no turn: three more numbers have less by chance

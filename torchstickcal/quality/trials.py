@@ -25,7 +25,7 @@ _SCALES = (1 / 3, 0.5, 2 / 3, 0.75, 4 / 3, 1.5, 2.0, 3.0)
 """Ratios of resolutions that videos are commonly converted by."""
 _LEAST_OF_PLACES, _GAIN_OF_PLACES, _RATIO_OF_PLACES = 0.45, 0.1, 1.25
 """Share of a camera's keypoints that agree with it at two places, one before and one after some frame: the least, and over that
-at one place."""
+at one place. Or half of those that contradict it at one place agree."""
 _LARGEST_SHIFT_S = 1.0
 _COARSE_SHIFTS = 12
 
@@ -229,7 +229,7 @@ def moved_within(rest: Rest, sight: Sight) -> tuple[int, Resection, Resection] |
     total = usable.sum()
     share = float((agree[0][:frame].sum() + agree[1][frame:].sum()) / total.clamp_min(1))
     single = max(float(one.sum() / total.clamp_min(1)) for one in agree)
-    least = max(_LEAST_OF_PLACES, single + _GAIN_OF_PLACES, _RATIO_OF_PLACES * single)
+    least = max(_LEAST_OF_PLACES, single + _GAIN_OF_PLACES, min(_RATIO_OF_PLACES * single, (1 + single) / 2))
     if not third // 2 < frame < frames - third // 2 or share < least:
         return None
     before, after = rest.placed(sight, slice(0, frame)), rest.placed(sight, slice(frame, frames))

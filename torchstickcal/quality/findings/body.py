@@ -54,7 +54,7 @@ def height_m(points: Tensor, places: dict[str, int]) -> float | None:
 
 
 def _height(evidence: Evidence, places: dict[str, int]) -> Iterator[Finding]:
-    height = height_m(evidence.points, places)
+    height = height_m(evidence.points_with_depth, places)
     if height is None or _SHORT_M <= height <= _TALL_M:
         return
     impossible = not _SHORTEST_M <= height <= _TALLEST_M

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 
 from torchstickcal.geometry import se3
@@ -60,8 +60,9 @@ def causes(evidence: Evidence) -> Iterator[Finding]:
     order = agreement.argsort().tolist()
     suspicious = (evidence.absurd_focals | evidence.off_centre).tolist()
     off_centre = [camera for camera in order if evidence.off_centre[camera]]
+    at_end = [camera for camera in order if evidence.set_aside_at_end[camera]]
     doubted = [c for c in order if float(agreement[c]) < _SUSPECT_SHARE or suspicious[c]]
-    suspects = off_centre or (doubted if evidence.cameras > 3 else []) or order
+    suspects = off_centre or at_end or (doubted if evidence.cameras > 3 else []) or order
     best: tuple[float, int, Rest] | None = None
     for camera in suspects[:_MOST_SUSPECTS]:
         rest = without(evidence, camera)
@@ -71,6 +72,7 @@ def causes(evidence: Evidence) -> Iterator[Finding]:
         return
     _, camera, rest = best
     worse = bool(evidence.doubtful[camera]) or float(agreement[camera]) < _BEHIND_OTHERS * rest.share
+    worse |= bool(evidence.set_aside_at_end[camera])
     noisy = evidence.noise_mrad > _NOISY_MRAD and rest.noise_mrad < _NOISE_RATIO * evidence.noise_mrad
     if rest.share < _SOUND_SHARE or not (worse or noisy or suspicious[camera]):
         return
@@ -97,28 +99,30 @@ def _explained(evidence: Evidence, camera: int, rest: Rest, agreement: float) ->
     plain = rest.placed(sight)
     as_given = 0.0 if plain is None else plain[0].share
 
-    def cause(code: str, what: str, advice: str, share: float, frames: tuple[int, int] | None = None) -> Finding:
+    def cause(code: str, what: str, advice: str, share: float, is_cause: bool = True) -> Finding:
         return Finding(
             code,
             Severity.SERIOUS,
             f"{name}: {what} ({100 * share:.0f} % of them; {100 * as_given:.0f} % as given).",
             advice,
             cameras=(name,),
-            frames=frames,
             figure=share,
             limit=_SOUND_SHARE,
             unit="share",
-            is_cause=True,
+            is_cause=is_cause,
         )
 
     found = [(h, placed[0]) for h in hypotheses() if (placed := rest.placed(h.changed(sight))) is not None]
-    if (best := _best(found)) is not None and _explains(best[1], None if plain is None else plain[0]):
+    best = _best(found)
+    if best is not None and not _explains(best[1], None if plain is None else plain[0]):
+        best = None
+    moved = moved_within(rest, sight) if as_given < _WHOLE_SHARE or best is not None else None
+    finding = None if moved is None else _moved(evidence, camera, *moved)
+    if best is not None and (moved is None or finding is None or not _closer(moved[1:], best[1])):
         hypothesis, placed = best
         return cause(hypothesis.code, hypothesis.what, hypothesis.advice, placed.share)
-    if as_given < _WHOLE_SHARE and (moved := moved_within(rest, sight)) is not None:
-        finding = _moved(evidence, camera, *moved)
-        if finding is not None:
-            return finding
+    if finding is not None:
+        return finding
     if as_given > _SOUND_SHARE:
         if as_given < agreement + _CLEAR_GAIN:
             return None
@@ -127,6 +131,7 @@ def _explained(evidence: Evidence, camera: int, rest: Rest, agreement: float) ->
             "its keypoints agree with the other cameras at another place than the one that was found",
             "Calibrate the other cameras first, or give a session in which this camera shares more with them.",
             as_given,
+            is_cause=False,
         )
     later, share = shifted_share(rest, sight, evidence.ended.frames[0].rate_hz)
     if later and share > max(_SOUND_SHARE, _IN_TIME_SHARE * rest.share, as_given + _GAIN):
@@ -165,9 +170,15 @@ def _explains(placed: Resection, plain: Resection | None) -> bool:
     return closer or placed.share > plain.share + gain
 
 
-def _moved(evidence: Evidence, camera: int, frame: int, before: object, after: object) -> Finding | None:
+def _closer(places: Sequence[Resection], single: Resection) -> bool:
+    """Whether a camera fits the others at two places as often as at one by another explanation, and clearly closer."""
+    farthest, least = max(one.distance_sigmas for one in places), min(one.share for one in places)
+    return least > single.share - _ALIKE and farthest < _CLOSER * single.distance_sigmas
+
+
+def _moved(evidence: Evidence, camera: int, frame: int, before: Resection, after: Resection) -> Finding | None:
     name = evidence.camera(camera)
-    poses = [(one.rotation, one.translation) for one in (before, after)]  # type: ignore[attr-defined]
+    poses = [(one.rotation, one.translation) for one in (before, after)]
     angle = float(rotation_angle(poses[1][0] @ poses[0][0].mT).rad2deg())
     shift = float((se3.camera_centres(*poses[1]) - se3.camera_centres(*poses[0])).norm())
     if angle > _FARTHEST_DEG or shift > _FARTHEST_SHARE * evidence.rig_m:

@@ -4,6 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
+import torch
+from torch import Tensor
+
 from torchstickcal.model.unknowns import CameraUnknown, all_unknowns
 from torchstickcal.quality.evidence import CONSTANT_SIGMAS, Evidence
 from torchstickcal.quality.finding import Finding, Severity
@@ -14,6 +17,9 @@ from torchstickcal.result import CameraParameter
 _CONTRADICTED_SIGMAS = 4.0
 _CLEAR_SIGMAS = 8.0
 """For values with a weak prior, which biased keypoints move easily."""
+_ASTRAY, _LEFT_SIGMAS = 0.1, 5.0
+"""Error of a given focal length that was estimated, from which on such values are contradicted already by fewer standard
+deviations, and are serious: the focal length has explained most of what they would."""
 _OPEN_SHARE = 0.5
 _WRONG_FOCAL = 0.02
 """Error of a focal length from which on the camera's distance is wrong by 2 %. Biased keypoints alone make 1 to 2 %."""
@@ -135,7 +141,9 @@ def _different(evidence: Evidence, unknown: CameraUnknown, parameter: CameraPara
         return
     difference = (parameter.by_component("suggested") - parameter.by_component("given")).abs()
     far = (difference > parameter.by_component("prior_std")).any(1)
-    for camera in (far & (evidence.contradictions[unknown.name] > _CLEAR_SIGMAS**2)).nonzero().flatten().tolist():
+    astray = _focals_astray(evidence)
+    limits = astray.double() * (_LEFT_SIGMAS - _CLEAR_SIGMAS) + _CLEAR_SIGMAS
+    for camera in (far & (evidence.contradictions[unknown.name] > limits**2)).nonzero().flatten().tolist():
         name = evidence.camera(camera)
         pairs = zip(
             parameter.by_component("suggested")[camera].tolist(), parameter.by_component("given")[camera].tolist(), strict=True
@@ -146,15 +154,22 @@ def _different(evidence: Evidence, unknown: CameraUnknown, parameter: CameraPara
         )
         yield Finding(
             f"{unknown.name}_contradicted",
-            Severity.CAUTION,
+            Severity.SERIOUS if astray[camera] else Severity.CAUTION,
             f"{name}: the keypoints suggest another {unknown.label}: {values}.",
             f"Check it, or estimate it (refine {next(iter(unknown.variants))!r}).",
             cameras=(name,),
             figure=float(evidence.contradictions[unknown.name][camera].sqrt()),
-            limit=_CLEAR_SIGMAS,
+            limit=float(limits[camera]),
             unit="standard deviations",
             is_cause=evidence.explains_most("lens"),
         )
+
+
+def _focals_astray(evidence: Evidence) -> Tensor:
+    """(C,), the cameras whose focal length was estimated far from the given one: it may have taken up another error of the
+    lens, most of which it can explain."""
+    focal = evidence.unknowns["focal"]
+    return (focal.value / focal.given - 1).abs() > _ASTRAY if focal.refined else torch.zeros_like(focal.given, dtype=torch.bool)
 
 
 def _matters(evidence: Evidence, name: str, difference: float, given: float) -> bool:
