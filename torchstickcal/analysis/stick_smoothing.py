@@ -55,10 +55,11 @@ class _Motion:
 
     @classmethod
     def likeliest(cls, near: Array, variances: Array, step: float) -> _Motion:
-        """Of values (O, T, D) around frames, whose variances are (T,), NaN where a value is not known."""
-        known = variances[np.isfinite(variances)]
-        typical = float(np.sqrt(np.median(known))) if len(known) else 1.0
-        scales, sizes, smooth = likeliest(near[:, :, None] / typical, step)
+        """Of values (O, T, D) around frames and their variances (O, T); NaN where a value is not known."""
+        known = np.isfinite(variances)
+        mean = np.where(known, variances, 0.0).sum(0) / np.maximum(known.sum(0), 1)
+        typical = np.sqrt(np.where(mean > 0, mean, 1.0))
+        scales, sizes, smooth = likeliest(near[:, :, None] / typical[:, None, None], step)
         return cls(scales[:, 0], sizes[:, 0] * typical, smooth[:, 0])
 
     def part(self, frames: slice) -> _Motion:
@@ -133,8 +134,8 @@ class StickSmoother:
         noise = np.stack([_noise_from(alone, offset) for offset in offsets])
         noise[~np.isfinite(near).all(-1)] = np.nan
         near[~np.stack([shifted(whole[:, None, None] * 1.0, offset)[:, 0, 0] == 1 for offset in offsets])] = np.nan
-        own = np.where(whole[:, None], np.diagonal(alone.covariances, axis1=1, axis2=2), np.nan)
-        motions = [_Motion.likeliest(near[..., part], own[:, part].mean(-1), step) for part in (_PLACE, _TURN)]
+        own = np.where(np.isfinite(near), np.diagonal(noise, axis1=2, axis2=3), np.nan)
+        motions = [_Motion.likeliest(near[..., part], own[..., part].mean(-1), step) for part in (_PLACE, _TURN)]
         apart = np.stack([offsets_s(tracks.times, offset) for offset in offsets])
         weights = np.empty((len(near), len(base), 2, _NUMBERS, _NUMBERS))
         for first in range(0, len(base), _CHUNK):
@@ -180,7 +181,7 @@ class StickSmoother:
                 near = slice(first, first + _LONG_CHUNK)
                 lost = self._lost(part, motion, near) * waves[near, None, None, None]
                 parts = np.stack([lost.real, -lost.imag]).reshape(2, -1, coefficients.shape[1])
-                drawn = (parts @ coefficients).sum(0).reshape(-1, 2, _NUMBERS, count)
+                drawn = (parts @ coefficients).sum(0).reshape(len(lost), 2, _NUMBERS, count)
                 missed[:, :, near] += drawn.transpose(1, 3, 0, 2)
         return missed
 
