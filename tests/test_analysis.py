@@ -17,9 +17,12 @@ from torchstickcal.analysis import ANGLES, EVENTS, SPORTS, Analysis, analyse, mu
 from torchstickcal.analysis.angles import missing_points, with_derived
 from torchstickcal.analysis.interpolation import at
 from torchstickcal.analysis.phases import events_of, swing_peaks
+from torchstickcal.analysis.pictures import curves_picture
 from torchstickcal.analysis.smoothing import from_sphere, on_sphere, smoother
 from torchstickcal.analysis.stick import StickMotion
-from torchstickcal.analysis.tracks import tracks_of
+from torchstickcal.analysis.stick_smoothing import StickSmoother
+from torchstickcal.analysis.tables import table, write_tables
+from torchstickcal.analysis.tracks import Tracks, tracks_of
 from torchstickcal.cli import main
 from torchstickcal.io import Rig, write_npz
 from torchstickcal.simulate import Motion, action
@@ -190,6 +193,66 @@ class TestSmoothing:
         assert np.linalg.norm(in_space, axis=-1)[inner].max() < 19.8
 
 
+class TestStickSmoothing:
+    """A stick of 1 m whose hands move on a small circle and whose direction turns unevenly."""
+
+    TIMES = np.arange(240) / FPS
+
+    def moved(self, times: np.ndarray) -> np.ndarray:
+        """Both ends, (T, 2, 3)."""
+        angle = 3 * times + 1.2 * np.sin(5 * times)
+        hands = 0.3 * np.stack([np.cos(4 * times), np.sin(4 * times), 0.2 * np.cos(3 * times)], axis=-1)
+        tilt = 0.4 * np.sin(2 * times)
+        along = np.stack([np.cos(angle) * np.cos(tilt), np.sin(angle) * np.cos(tilt), np.sin(tilt)], axis=-1)
+        return np.stack([hands, hands + along], axis=1)
+
+    def tracks(self, roots: np.ndarray, seed: int = 0) -> Tracks:
+        """With errors of square roots of covariances ``roots`` (T, 2, 3, 3)."""
+        noise = np.random.default_rng(seed).standard_normal((len(self.TIMES), 2, 3, 1))
+        points = self.moved(self.TIMES) + (roots @ noise)[..., 0]
+        none = np.zeros((*points.shape, 1))
+        return Tracks(self.TIMES, points, roots, none, np.zeros((1, 1)), ("butt", "tip"), ((0, 1, 1.0, 0.0),), UP)
+
+    def errors(self, tracks: Tracks, draws: int = 0) -> tuple[np.ndarray, np.ndarray]:
+        """Of the velocity of the tip, (T, 3), and its draws, (N, T, 3), without both ends of the recording."""
+        motion = StickSmoother.of(tracks, 0)(tracks.drawn(draws), np.ones(1 + draws))
+        true = (self.moved(self.TIMES + 1e-5) - self.moved(self.TIMES - 1e-5))[:, 1] / 2e-5
+        inner = slice(15, -15)
+        return (motion.tip_velocity[0] - true)[inner], (motion.tip_velocity[1:] - motion.tip_velocity[0])[:, inner]
+
+    def roots(self, tip: tuple[float, float, float] = (0.005, 0.005, 0.005)) -> np.ndarray:
+        return np.tile(np.stack([0.005 * np.eye(3), np.diag(tip)]), (len(self.TIMES), 1, 1, 1))
+
+    @pytest.mark.parametrize("tip", [(0.005, 0.005, 0.005), (0.04, 0.005, 0.005), (0.01, 0.03, 0.02)])
+    def test_stated_deviations_are_right(self, tip: tuple[float, float, float]):
+        ratios = []
+        for seed in range(3):
+            error, drawn = self.errors(self.tracks(self.roots(tip), seed), 12)
+            ratios.append(error / np.sqrt(np.square(drawn).mean(0)))
+        assert 0.75 < np.sqrt(np.square(ratios).mean()) < 1.3
+
+    @pytest.mark.parametrize("tip", [(0.05, 0.005, 0.005), (0.005, 0.05, 0.05)])
+    def test_each_end_counts_by_its_own_covariance(self, tip: tuple[float, float, float]):
+        """Not by the mean over its axes."""
+        tracks = self.tracks(self.roots(tip))
+        alike = np.sqrt(np.mean(np.square(tip)))
+        error, _ = self.errors(tracks)
+        without, _ = self.errors(replace(tracks, roots=self.roots((alike, alike, alike))))
+        assert np.sqrt(np.square(error).mean()) < 0.9 * np.sqrt(np.square(without).mean())
+
+    def test_an_end_that_is_not_seen_for_some_frames_is_bridged_and_a_long_gap_is_not(self):
+        roots = self.roots()
+        roots[60:63, 1], roots[120:150, 0] = np.nan, np.nan
+        motion = StickSmoother.of(self.tracks(roots), 0)(self.tracks(roots).drawn(0), np.ones(1))
+        apart = np.linalg.norm(motion.tip[0] - self.moved(self.TIMES)[:, 1], axis=-1)
+        assert apart[60:63].max() < 0.01
+        assert np.isnan(apart[125:145]).all()
+
+    def test_an_exact_motion_stays_as_it_is(self):
+        tracks = replace(self.tracks(0.001 * self.roots()), points=self.moved(self.TIMES))
+        assert np.abs(self.errors(tracks)[0]).max() < 0.01
+
+
 class TestTracks:
     def test_frames_are_triangulated_by_themselves_and_errors_are_as_stated(self, golf):
         calibration, true, _ = golf
@@ -276,6 +339,11 @@ class TestPhases:
         assert 1.0 < takeaway < 1.1
         assert 2.0 < top < 2.2
 
+    @pytest.mark.parametrize("waggle_rad_s", [0.4, 0.55])
+    def test_a_batter_who_moves_the_bat_slowly_has_not_begun(self, waggle_rad_s: float):
+        """Before it is carried back at up to 0.94 m/s, the bat turns about its end, at up to 0.27 m/s as a whole."""
+        self.test_a_bat_that_is_carried_back_begins_when_it_moves(0.2, waggle_rad_s)
+
     def test_events_of_a_swing_that_is_cut_off_are_unknown(self):
         times, motion = true_motion("golf", 1.5)
         (peak,) = swing_peaks(times, motion.turn_rate[0])
@@ -348,6 +416,54 @@ class TestAnalysis:
         assert "x_factor" not in found.curves
         assert "left_elbow_flexion" in found.curves
         assert any("left_knee_flexion" in note for note in found.notes)
+
+
+class TestNotFound:
+    """What is said of a swing of which a part is missing."""
+
+    @staticmethod
+    def part(calibration: Calibration, frames: slice) -> Calibration:
+        index = calibration.frame_index[:, frames]
+        return replace(
+            calibration,
+            points=calibration.points[frames],
+            residuals_px=calibration.residuals_px[:, frames],
+            inliers=calibration.inliers[:, frames],
+            frame_index=index - index.min(),
+            times=None,
+        )
+
+    @pytest.mark.parametrize(
+        ("frames", "missing", "without"),
+        [
+            (slice(60, None), ("takeaway", "impact"), "tempo"),
+            (slice(0, 150), ("impact", "finish"), "peak_tip_speed"),
+            (slice(60, 150), ("takeaway", "impact", "finish"), "backswing"),
+        ],
+    )
+    def test_every_event_that_is_missing_is_named(
+        self, golf, tmp_path: Path, frames: slice, missing: tuple[str, ...], without: str
+    ):
+        found = analyse(self.part(golf[0], frames), "golf", draws=2)
+        assert [swing.not_found for swing in found.swings] == [missing]
+        text = table(found)
+        assert "nan" not in text.lower()
+        assert text.splitlines()[1].count("not found") == len(missing)
+        said = {"takeaway": "no address found", "impact": "no impact found", "finish": "no finish found"}
+        for event, sentence in said.items():
+            assert (sentence in text) == (event in missing)
+        assert without in next(note for note in found.notes if "without a value" in note)
+        assert any("counted from the first frame" in note for note in found.notes) == ("takeaway" in missing)
+        write_tables(tmp_path, found)
+        assert json.loads((tmp_path / "analysis.json").read_text())["swings"][0]["not_found"] == list(missing)
+        rows = list(csv.DictReader((tmp_path / "swings.csv").open()))
+        assert [row["event"] for row in rows if row["figure"] == "not_found"] == list(missing)
+        assert curves_picture(found).get_suptitle().count("found") == len(missing)
+
+    def test_a_whole_swing_has_no_such_note(self, golf_analysis):
+        assert golf_analysis.swings[0].not_found == ()
+        assert not any("found" in note for note in golf_analysis.notes)
+        assert curves_picture(golf_analysis).get_suptitle() == ""
 
 
 class TestRepeats:

@@ -10,10 +10,11 @@ from numpy.typing import NDArray
 
 from torchstickcal.analysis.angles import ANGLES, Angle, missing_points, with_derived
 from torchstickcal.analysis.interpolation import at
-from torchstickcal.analysis.phases import EVENTS, Sport, events_of, lowest_at, sport_named, swing_peaks
+from torchstickcal.analysis.phases import EVENTS, NOT_FOUND, Sport, events_of, lowest_at, sport_named, swing_peaks
 from torchstickcal.analysis.repeats import multiple_correlation, normalised
 from torchstickcal.analysis.smoothing import smoother
-from torchstickcal.analysis.stick import StickMotion, StickSmoother
+from torchstickcal.analysis.stick import StickMotion
+from torchstickcal.analysis.stick_smoothing import StickSmoother
 from torchstickcal.analysis.tracks import Tracks, tracks_of
 from torchstickcal.errors import CalibrationError
 from torchstickcal.io.skeletons import conventional
@@ -60,6 +61,11 @@ class Swing:
     """what was measured of the swing"""
     angles: Mapping[str, Mapping[str, Figure]]
     """by the name of the angle, then of the event"""
+
+    @property
+    def not_found(self) -> tuple[str, ...]:
+        """Events that were not found; their times, and what depends on them, are NaN."""
+        return tuple(name for name, figure in self.events.items() if np.isnan(figure.value))
 
 
 @dataclass(frozen=True, eq=False)
@@ -152,13 +158,14 @@ def analysis_of(tracks: Tracks, sport: str, rules: Sport, stick: int, draws: int
     units = {name: {"tip_speed": "m/s", "stick_turn_rate": "deg/s"}.get(name, "deg") for name in stacked}
     if rules.needs_up and tracks.up is None:
         notes.append("Without a vertical the impact is where the end of the stick is fastest.")
+    swings = tuple(_swing(tracks, motion, stacked, units, events[:, number]) for number in range(len(peaks)))
     return Analysis(
         times=tracks.times,
         curves={name: Curve(values[0], _std(values), units[name]) for name, values in stacked.items()},
-        swings=tuple(_swing(tracks, motion, stacked, units, events[:, number]) for number in range(len(peaks))),
+        swings=swings,
         repeated=_repeated(tracks.times, stacked, units, events),
         sport=sport,
-        notes=(*tracks.notes, *notes, *_about_swings(events)),
+        notes=(*tracks.notes, *notes, *_about_swings(swings)),
     )
 
 
@@ -306,8 +313,17 @@ def _std(values: Array) -> Array:
     return np.where(count >= (1 - _MOST_UNKNOWN) * len(squares), np.sqrt(mean), np.nan)
 
 
-def _about_swings(events: Array) -> list[str]:
-    if not events.shape[1]:
+def _about_swings(swings: Sequence[Swing]) -> list[str]:
+    """Sentences about swings and events that were not found, and what has no value for this reason."""
+    if not swings:
         return ["No swing was found: the stick is not known in enough frames."]
-    cut = sum(not np.isfinite(of_swing).all() for of_swing in events[0])
-    return [f"{cut} of {events.shape[1]} swings are not complete in the recording."] if cut else []
+    notes = []
+    for number, swing in enumerate(swings, 1):
+        notes += [f"Swing {number}: {NOT_FOUND[event]}." for event in swing.not_found]
+        unknown = [name for name, figure in swing.figures.items() if np.isnan(figure.value)]
+        notes += [f"Swing {number}: without a value are {', '.join(unknown)}."] if unknown else []
+    if any(swing.not_found for swing in swings):
+        notes.append("Let the recording begin a second before the first swing and end a second after the last one.")
+    if all("takeaway" in swing.not_found for swing in swings):
+        notes.append("Turns of trunk and pelvis are counted from the first frame, because no takeaway was found.")
+    return notes

@@ -29,7 +29,10 @@ ENDED = 0.05
 FAST_AGAIN = 0.3
 """Share of the largest turn rate by which the stick turned faster before a moment, for that moment to be between two swings."""
 BEGUN = 0.20
-"""Share of the largest turn rate, or speed, of the backswing at which it begins."""
+"""Share of the largest turn rate of the backswing at which it begins."""
+CARRIED = 0.30
+"""Share of the largest speed of the stick in the backswing at which it begins where the stick is carried. A batter who stands
+moves the bat at up to 20 %."""
 BACKSWING_DEG = 10.0
 """How far the stick is turned from where it is at the top when the search for the takeaway begins. Where it is carried, its end
 is as far away."""
@@ -109,12 +112,20 @@ RULES = {
     f"higher peak is within {APART_S:g} s",
     "takeaway": f"the last time before the backswing at which the stick turned at less than {100 * BEGUN:.0f} % of the largest "
     "rate in it; in baseball, where the bat is carried back and hardly turns: at which the bat moved at less than "
-    f"{100 * BEGUN:.0f} % of its largest speed in it, as the root mean square over the points of the bat",
+    f"{100 * CARRIED:.0f} % of its largest speed in it, as the root mean square over the points of the bat",
     "top": f"the last time before the peak at which the stick turned at less than {100 * ONSET:.0f} % of the peak's rate; if "
     "it never did since the backswing, the moment at which it turned slowest",
     "finish": f"the first time after the peak at which the stick turns at less than {100 * ENDED:.0f} % of the peak's rate",
 }
 """The rules for the other events, the same for all sports."""
+
+NOT_FOUND = {
+    "takeaway": "no address found: before the backswing the stick is never slow in the recording, or it is not seen",
+    "top": "no top found: before it is fastest the stick is never slow in the recording, or it is not seen",
+    "impact": "no impact found: its rule needs another event, and this was not found",
+    "finish": "no finish found: after it was fastest the stick never stops in the recording, or it is not seen",
+}
+"""What is said where an event is not found."""
 
 
 def sport_named(name: str) -> Sport:
@@ -164,10 +175,10 @@ def events_of(times: Array, motion: StickMotion, peak: int, sport: Sport, up: Ar
     finish = _falls_below(times, rate, peak, ENDED * rate[peak])
     if sport.stands:
         length_m = float(np.nanmedian(np.linalg.norm(tip - motion.start[number], axis=-1)))
-        takeaway = _takeaway(times, motion.whole_speed[number], tip / length_m, top)
+        takeaway = _takeaway(times, motion.whole_speed[number], tip / length_m, top, CARRIED)
     else:
         stick = tip - motion.start[number]
-        takeaway = _takeaway(times, rate, stick / np.linalg.norm(stick, axis=-1, keepdims=True), top)
+        takeaway = _takeaway(times, rate, stick / np.linalg.norm(stick, axis=-1, keepdims=True), top, BEGUN)
     if sport.needs_up and up is None:
         sport = SPORTS["any"]
     if not np.isfinite([top, finish]).all():
@@ -176,12 +187,13 @@ def events_of(times: Array, motion: StickMotion, peak: int, sport: Sport, up: Ar
     return np.array([takeaway, top, impact, finish])
 
 
-def _takeaway(times: Array, fast: Array, place: Array, top_s: float) -> float:
+def _takeaway(times: Array, fast: Array, place: Array, top_s: float, begun: float) -> float:
     """Back from the top over the backswing, to where the stick moved much more slowly than since.
 
     Args:
         times: (T,). fast: how fast it turned or moved, (T,).
         place: its direction, or the place of its end in lengths of the stick, (T, 3). top_s: time of the top.
+        begun: share of the largest of ``fast`` at which the backswing begins.
     """
     if not np.isfinite(top_s):
         return np.nan
@@ -190,8 +202,8 @@ def _takeaway(times: Array, fast: Array, place: Array, top_s: float) -> float:
     while frame >= 0 and times[frame] > top_s - _LONGEST_BACKSWING_S and np.isfinite(fast[frame]):
         if largest or away[frame] > 2 * np.sin(np.radians(BACKSWING_DEG) / 2):
             largest = max(largest, fast[frame])
-        if fast[frame] < BEGUN * largest:
-            return _crossing(times, fast, frame, BEGUN * largest)
+        if fast[frame] < begun * largest:
+            return _crossing(times, fast, frame, begun * largest)
         frame -= 1
     return np.nan
 

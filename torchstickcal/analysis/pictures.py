@@ -6,7 +6,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure as Picture
 
 from torchstickcal.analysis.analyse import Analysis
-from torchstickcal.analysis.phases import EVENTS
+from torchstickcal.analysis.phases import EVENTS, NOT_FOUND
 from torchstickcal.analysis.repeats import SHARES
 
 _LEFT, _RIGHT, _MIDDLE = "#1f5fa8", "#d1495b", "#33383d"
@@ -27,8 +27,12 @@ def curves_picture(analysis: Analysis) -> Picture:
             axes.plot(analysis.times, curve.values, color=colour, linewidth=1)
         for swing in analysis.swings:
             for event, figure in swing.events.items():
-                axes.axvline(figure.value, color=_EVENT_COLOURS[event], linewidth=0.7, linestyle="--")
+                if event not in swing.not_found:
+                    axes.axvline(figure.value, color=_EVENT_COLOURS[event], linewidth=0.7, linestyle="--")
         _label(axes, title, analysis.curves[names[0]].unit, "time (s)")
+    missing = [f"swing {n}: {NOT_FOUND[e].split(':')[0]}" for n, s in enumerate(analysis.swings, 1) for e in s.not_found]
+    if missing:
+        picture.suptitle("; ".join(missing), fontsize=9)
     return picture
 
 
@@ -42,7 +46,8 @@ def repeated_picture(analysis: Analysis) -> Picture:
             r, colour = analysis.repeated[name], _colour(name)
             axes.fill_between(SHARES, r.mean - r.spread, r.mean + r.spread, color=colour, alpha=0.2)
             axes.plot(SHARES, r.mean, color=colour, linewidth=1)
-            found.append(f"{r.correlation.value:.3f}")
+            known = r.correlation.value == r.correlation.value
+            found.append(f"{r.correlation.value:.3f}" if known else "not defined")
         _label(axes, f"{title} (CMC {', '.join(found)})", analysis.repeated[names[0]].unit, "swing (%)")
     return picture
 

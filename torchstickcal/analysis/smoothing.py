@@ -1,9 +1,9 @@
 """Smoothing by Gaussian processes whose time scale and size follow the motion.
 
 Around each frame a track is a straight line plus a random smooth motion (a Gaussian process with a Matern covariance of
-smoothness 7/2). How fast and how far this motion goes is what makes the values around the frame most likely, given the noise of
-the keypoints. A stick at rest is averaged over all frames around, a fast one over few. What smoothing leaves out has a known
-size too: it is drawn together with the errors of the keypoints.
+smoothness 7/2, or of 5/2 where that is much more likely). How fast and how far this motion goes is what makes the values around
+the frame most likely, given the noise of the keypoints. A stick at rest is averaged over all frames around, a fast one over
+few. What smoothing leaves out has a known size too: it is drawn together with the errors of the keypoints.
 """
 
 from __future__ import annotations
@@ -27,12 +27,14 @@ _REACH_S, _REACH_FRAMES = 0.135, (8, 24)
 """How far before and after a frame values are used, and the least and the largest number of frames."""
 _FARTHEST_FRAMES, _FARTHEST_S = 3, 0.025
 """How far from a frame in which a point is known it is still estimated; the larger of both."""
-_BESIDE = 2
+_ROUGHER = 2.0
+"""By how much the logarithm of the likelihood of a less smooth motion must be larger for this motion to be taken: 7 times."""
+BESIDE = 2
 """So many values are known before and after a frame whose velocity is estimated."""
-_TREND = 2
+TREND = 2
 """Numbers of a straight line"""
 _FARTHEST_TURN_RAD = 1.75
-_FREQUENCIES = np.geomspace(0.02, 60.0, 64)
+FREQUENCIES = np.geomspace(0.02, 60.0, 64)
 """Of the random motions, radians per time scale"""
 _CHUNK = 2048
 
@@ -94,17 +96,17 @@ class Smoother:
         A motion is a sum of waves, whose phases advance with the time over its scale. Smoothing multiplies a wave by the sum of
         the weights times the wave at the offsets.
         """
-        coefficients = rng.standard_normal((2, len(_FREQUENCIES), count * axes))
+        coefficients = rng.standard_normal((2, len(FREQUENCIES), count * axes))
         waves = coefficients[0] + 1j * coefficients[1]
         scales, step = self.scales_s[:, track], np.diff(self.times, prepend=self.times[:1])
-        phases = np.exp(1j * np.cumsum(step / scales)[:, None] * _FREQUENCIES)
+        phases = np.exp(1j * np.cumsum(step / scales)[:, None] * FREQUENCIES)
         kept = np.zeros((2, *phases.shape), dtype=complex)
         reach = len(self.weights) // 2
         for offset, of_offset in zip(range(-reach, reach + 1), self.weights[:, :, track], strict=True):
-            wave = np.exp(1j * (_offsets(self.times, offset) / scales)[:, None] * _FREQUENCIES)
+            wave = np.exp(1j * (offsets_s(self.times, offset) / scales)[:, None] * FREQUENCIES)
             kept += of_offset.T[:, :, None] * wave
-        size = self.sizes[:, track, None] * np.where(self.smooth[:, track, None], _heights(7), _heights(5))
-        missed = (size * phases * (1 - kept[0]), size * phases * (1j * _FREQUENCIES / scales[:, None] - kept[1]))
+        size = self.sizes[:, track, None] * np.where(self.smooth[:, track, None], heights(7), heights(5))
+        missed = (size * phases * (1 - kept[0]), size * phases * (1j * FREQUENCIES / scales[:, None] - kept[1]))
         value, slope = ((part @ waves).real.reshape(len(scales), count, axes).swapaxes(0, 1) for part in missed)
         return value, slope
 
@@ -127,53 +129,71 @@ def smoother(times: Array, values: Array, variances: Array, neighbours: Neighbou
         True
     """
     frames = len(times)
-    step = float(np.median(np.diff(times))) if frames > 1 else 1.0
-    reach = min(max(frames - 1, _BESIDE), int(np.clip(round(_REACH_S / step), *_REACH_FRAMES)))
+    step, reach, farthest = windows(times)
     offsets = range(-reach, reach + 1)
     known = np.isfinite(values).all(-1) & np.isfinite(variances) & (variances > 0)
     usable = np.where(known, variances, np.nan)
     typical = np.array([np.median(v[np.isfinite(v)]) if np.isfinite(v).any() else 1.0 for v in usable.T])
     near = np.stack([neighbours(np.where(known[..., None], values, np.nan), offset) for offset in offsets])
-    scales, sizes, smooth = _likeliest(near / np.sqrt(typical)[:, None], step)
+    scales, sizes, smooth = likeliest(near / np.sqrt(typical)[:, None], step)
     noise = np.stack([shifted(usable[..., None] / typical[:, None], offset)[..., 0] for offset in offsets])
     noise[~np.isfinite(near).all(-1)] = np.nan
-    apart = np.stack([_offsets(times, offset) for offset in offsets])
+    apart = np.stack([offsets_s(times, offset) for offset in offsets])
     weights = np.empty((*noise.shape, 2))
     for first in range(0, frames, max(1, _CHUNK // max(1, values.shape[1]))):
         part = slice(first, first + max(1, _CHUNK // max(1, values.shape[1])))
         weights[:, part] = _weights(apart[:, part], noise[:, part], scales[part], sizes[part], smooth[part])
-    estimated = _near_a_value(known, max(_FARTHEST_FRAMES, round(_FARTHEST_S / step)))
-    seen = np.isfinite(noise)
-    estimated &= seen.sum(0) > _TREND
-    with_slope = estimated & (seen[:reach].sum(0) >= _BESIDE) & (seen[reach + 1 :].sum(0) >= _BESIDE)
-    weights = np.where(np.stack([estimated, with_slope], axis=-1), weights, np.nan)
+    weights = np.where(estimable(known, np.isfinite(noise), farthest), weights, np.nan)
     return Smoother(times, weights, scales, sizes * np.sqrt(typical), smooth, neighbours)
 
 
-def _offsets(times: Array, offset: int) -> Array:
+def windows(times: Array) -> tuple[float, int, int]:
+    """Seconds between frames at times (T,), how many frames before and after one are used, and how far from a frame in which
+    something is known it is still estimated, in frames.
+    """
+    frames = len(times)
+    step = float(np.median(np.diff(times))) if frames > 1 else 1.0
+    reach = min(max(frames - 1, BESIDE), int(np.clip(round(_REACH_S / step), *_REACH_FRAMES)))
+    return step, reach, max(_FARTHEST_FRAMES, round(_FARTHEST_S / step))
+
+
+def estimable(known: NDArray[np.bool_], seen: NDArray[np.bool_], farthest: int) -> NDArray[np.bool_]:
+    """Of which frames the value and its derivative can be estimated, (T, S, 2).
+
+    Args:
+        known: (T, S), where there is a value.
+        seen: (O, T, S), where there is one of those that are averaged.
+        farthest: frames from one with a value.
+    """
+    reach = len(seen) // 2
+    value = _near_a_value(known, farthest) & (seen.sum(0) > TREND)
+    return np.stack([value, value & (seen[:reach].sum(0) >= BESIDE) & (seen[reach + 1 :].sum(0) >= BESIDE)], axis=-1)
+
+
+def offsets_s(times: Array, offset: int) -> Array:
     """(T,), seconds from each frame to the one ``offset`` frames later; 0 where there is none."""
     return np.nan_to_num((shifted(times[:, None, None], offset) - times[:, None, None])[:, 0, 0])
 
 
-def _covariance(apart: Array, smooth: NDArray[np.bool_] | bool) -> Array:
+def covariance(apart: Array, smooth: NDArray[np.bool_] | bool) -> Array:
     """Of a motion of size 1 at times apart by so many time scales: Matern of smoothness 7/2 or 5/2."""
     z = np.where(smooth, np.sqrt(7.0), np.sqrt(5.0)) * np.abs(apart)
     return np.where(smooth, 1 + z + 0.4 * z**2 + z**3 / 15, 1 + z + z**2 / 3) * np.exp(-z)
 
 
-def _covariance_with_slope(apart: Array, smooth: NDArray[np.bool_] | bool) -> Array:
+def covariance_with_slope(apart: Array, smooth: NDArray[np.bool_] | bool) -> Array:
     """Of the derivative of such a motion at 0 with its values at times ``apart``."""
     z = np.where(smooth, np.sqrt(7.0), np.sqrt(5.0)) * np.abs(apart)
     return np.where(smooth, 1.4 * (1 + z + z**2 / 3), 5 / 3 * (1 + z)) * apart * np.exp(-z)
 
 
-def _heights(freedom: int) -> Array:
-    """Of waves of :data:`_FREQUENCIES` that make a motion of size 1 and smoothness ``freedom / 2``."""
-    power = (1 + _FREQUENCIES**2 / freedom) ** (-(freedom + 1) / 2) * np.gradient(_FREQUENCIES)
+def heights(freedom: int) -> Array:
+    """Of waves of :data:`FREQUENCIES` that make a motion of size 1 and smoothness ``freedom / 2``."""
+    power = (1 + FREQUENCIES**2 / freedom) ** (-(freedom + 1) / 2) * np.gradient(FREQUENCIES)
     return np.sqrt(power / power.sum())
 
 
-def _likeliest(near: Array, step: float) -> tuple[Array, Array, NDArray[np.bool_]]:
+def likeliest(near: Array, step: float) -> tuple[Array, Array, NDArray[np.bool_]]:
     """Scales in seconds, sizes and smoothness (T, S) that make the values (O, T, S, D) around each frame most likely.
 
     Args:
@@ -187,19 +207,19 @@ def _likeliest(near: Array, step: float) -> tuple[Array, Array, NDArray[np.bool_
     chosen = np.zeros((3, frames * tracks), dtype=np.intp)
     patterns, of_pattern = np.unique(np.isfinite(values).all(-1), axis=1, return_inverse=True)
     for number, pattern in enumerate(patterns.T):
-        if pattern.sum() <= _TREND:
+        if pattern.sum() <= TREND:
             continue
         index = np.flatnonzero(of_pattern == number)
         at = seconds[pattern]
-        free = np.linalg.qr(np.stack([np.ones_like(at), at], axis=-1), mode="complete")[0][:, _TREND:]
+        free = np.linalg.qr(np.stack([np.ones_like(at), at], axis=-1), mode="complete")[0][:, TREND:]
         seen = free.T @ values[pattern][:, index].reshape(pattern.sum(), -1)
         for smooth, (of_scale, scale) in product((True, False), enumerate(SCALES_S)):
-            spread, directions = np.linalg.eigh(free.T @ _covariance((at[:, None] - at) / scale, smooth) @ free)
+            spread, directions = np.linalg.eigh(free.T @ covariance((at[:, None] - at) / scale, smooth) @ free)
             squares = np.square(directions.T @ seen).reshape(len(spread), -1, axes).sum(-1)
             variances = 1 + SIZES[:, None] ** 2 * np.maximum(spread, 0.0)
             likelihood = -0.5 * ((1 / variances) @ squares + axes * np.log(variances).sum(-1, keepdims=True))
             of_size = likelihood.argmax(0)
-            value = np.take_along_axis(likelihood, of_size[None], 0)[0]
+            value = np.take_along_axis(likelihood, of_size[None], 0)[0] - (0.0 if smooth else _ROUGHER)
             better = value > best[index]
             best[index[better]] = value[better]
             chosen[:2, index[better]] = np.stack([np.full(better.sum(), of_scale), of_size[better]])
@@ -232,24 +252,22 @@ def _weights(apart: Array, noise: Array, scales: Array, sizes: Array, smooth: ND
     at = apart.T[:, None] / scales[..., None]
     power = np.square(sizes)[..., None]
     both = seen[..., :, None] & seen[..., None, :]
-    covariance = np.where(
-        both, power[..., None] * _covariance(at[..., :, None] - at[..., None, :], smooth[..., None, None]), 0.0
-    )
+    of_all = np.where(both, power[..., None] * covariance(at[..., :, None] - at[..., None, :], smooth[..., None, None]), 0.0)
     diagonal = np.arange(len(apart))
-    covariance[..., diagonal, diagonal] += np.where(seen, noise.transpose(1, 2, 0), 1.0)
+    of_all[..., diagonal, diagonal] += np.where(seen, noise.transpose(1, 2, 0), 1.0)
     motion = [
-        power * _covariance(at, smooth[..., None]),
-        power * _covariance_with_slope(at, smooth[..., None]) / scales[..., None],
+        power * covariance(at, smooth[..., None]),
+        power * covariance_with_slope(at, smooth[..., None]) / scales[..., None],
     ]
     line = [np.ones_like(at), at]
     right = np.where(seen[..., None], np.stack([*motion, *line], axis=-1), 0.0)
-    solved = np.linalg.solve(covariance, right)
-    line_rows = right[..., _TREND:].swapaxes(-1, -2)
-    wanted = np.zeros((*scales.shape, _TREND, 2))
+    solved = np.linalg.solve(of_all, right)
+    line_rows = right[..., TREND:].swapaxes(-1, -2)
+    wanted = np.zeros((*scales.shape, TREND, 2))
     wanted[..., 0, 0], wanted[..., 1, 1] = 1.0, 1 / scales
-    determined = seen.sum(-1) > _TREND
-    moments = np.where(determined[..., None, None], line_rows @ solved[..., _TREND:], np.eye(_TREND))
-    return (solved[..., :2] + solved[..., _TREND:] @ np.linalg.solve(moments, wanted - line_rows @ solved[..., :2])).transpose(
+    determined = seen.sum(-1) > TREND
+    moments = np.where(determined[..., None, None], line_rows @ solved[..., TREND:], np.eye(TREND))
+    return (solved[..., :2] + solved[..., TREND:] @ np.linalg.solve(moments, wanted - line_rows @ solved[..., :2])).transpose(
         2, 0, 1, 3
     )
 

@@ -33,6 +33,7 @@ def as_json(analysis: Analysis) -> dict[str, Any]:
         "swings": [
             {
                 "events": _figures(swing.events),
+                "not_found": list(swing.not_found),
                 "figures": _figures(swing.figures),
                 "angles": {name: _figures(events) for name, events in swing.angles.items()},
             }
@@ -52,7 +53,7 @@ def table(analysis: Analysis) -> str:
     """The swings as a text to print."""
     rows = [["swing", *EVENTS, "tempo", "tip speed (m/s)", "at impact (m/s)"]]
     for number, swing in enumerate(analysis.swings, 1):
-        times = [_shown(swing.events[event], 3) for event in EVENTS]
+        times = [_shown(swing.events[event], 3, "not found") for event in EVENTS]
         figures = swing.figures
         speeds = [_shown(figures[name], 2) for name in ("tempo", "peak_tip_speed", "impact_tip_speed")]
         rows.append([str(number), *times, *speeds])
@@ -61,8 +62,10 @@ def table(analysis: Analysis) -> str:
     return "\n".join([*lines, *(f"note: {note}" for note in analysis.notes)])
 
 
-def _shown(figure: Figure, digits: int) -> str:
-    return f"{figure.value:.{digits}f} +- {figure.std:.{digits}f}"
+def _shown(figure: Figure, digits: int, unknown: str = "-") -> str:
+    if figure.value != figure.value:
+        return unknown
+    return f"{figure.value:.{digits}f} +- {'?' if figure.std != figure.std else f'{figure.std:.{digits}f}'}"
 
 
 def _plain(figure: Figure) -> dict[str, Any]:
@@ -83,6 +86,7 @@ def _curve_rows(analysis: Analysis) -> Iterable[list[Any]]:
 def _swing_rows(analysis: Analysis) -> Iterable[list[Any]]:
     yield ["swing", "figure", "event", "value", "std", "unit"]
     for number, swing in enumerate(analysis.swings, 1):
+        yield from ([number, "not_found", event, "", "", ""] for event in swing.not_found)
         found = [("time", event, figure) for event, figure in swing.events.items()]
         found += [(name, "", figure) for name, figure in swing.figures.items()]
         found += [(name, event, figure) for name, events in swing.angles.items() for event, figure in events.items()]

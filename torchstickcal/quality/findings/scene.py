@@ -65,9 +65,10 @@ def scene(evidence: Evidence) -> Iterator[Finding]:
 
 
 def _size(evidence: Evidence) -> Iterator[Finding]:
-    """Cameras in whose images the athlete is small."""
+    """Cameras in whose images the athlete is small. Sticks alone do not say how large the athlete is."""
     size = evidence.observations.image_size
-    if size is None:
+    ends = {end for stick in evidence.observations.sticks for end in stick.ends}
+    if size is None or len(ends) == evidence.observations.keypoints.shape[2]:
         return
     m = evidence.measurements
     y = m.by_frame(m.pixels[0])[:, 1].double().where(m.by_frame(m.visible[0]), torch.nan)
