@@ -199,6 +199,28 @@ def test_what_explains_something_serious_comes_first():
     assert codes(Quality.of([note, small, Finding("caution", Severity.CAUTION, ".")]))[0] == "small"
 
 
+@pytest.mark.parametrize("refine", [[], ["time_offset"]])
+def test_what_wrong_focal_lengths_would_do_is_what_they_do(refine: list[str]):
+    observations = session(cameras=3, frames=30).observations
+    calibration = calibrate(observations, {"extends": "default", "refine": refine})
+    squared = 0.0
+    for camera in range(3):
+        intrinsics = observations.cameras.matrix.clone()
+        intrinsics[camera, [0, 1], [0, 1]] *= 1.001
+        wrong = calibrate(replace(observations, intrinsics=intrinsics), {"extends": "default", "refine": refine})
+        squared += float((wrong.camera_centres - calibration.camera_centres)[1:].square().sum(1).mean())
+    acceptance = calibration.quality.acceptance
+    assert acceptance is not None
+    assert acceptance.by_focal_m == pytest.approx(10 * squared**0.5, rel=0.02)
+    assert f"about {1000 * acceptance.by_focal_m:.2g} mm" in acceptance.focal_sentence
+
+
+def test_estimated_focal_lengths_are_not_taken_as_right():
+    acceptance = calibrate(session(cameras=4, frames=40).observations, refine=["focal"]).quality.acceptance
+    assert acceptance is not None
+    assert acceptance.focal_sentence == ""
+
+
 def test_every_keypoint_is_used_or_set_aside():
     given = session(cameras=3, frames=40)
     keypoints = given.observations.keypoints.clone()

@@ -138,6 +138,22 @@ class CameraCheck:
             name: Suggestion(deviation[0], variances[name].sqrt()) for name, deviation in every.by_name(values[None]).items()
         }
 
+    def tangents_by(self, name: str, deviation: float) -> Tensor:
+        """Covariance (6 (C - 1), 6 (C - 1)) of the cameras' tangents by errors of given values that nothing tells.
+
+        Args:
+            name: of an unknown that was not refined. It is wrong in each camera by itself, and the poses, and what was refined,
+                give way.
+            deviation: standard deviation of the error, in its own unit.
+        """
+        system, refined = self._system, set(self._adjustment.refined)
+        columns = {own: system.poses + column for own, column in system.every.columns.items()}
+        giving_way = [columns[unknown.name] for unknown in all_unknowns().values() if refined & set(unknown.variants)]
+        poses = torch.arange(system.poses, device=system.gradient.device)
+        free = torch.cat([poses, *(column.to(poses.device) for column in giving_way)])
+        response = covariance_of(system.information[free][:, free]) @ system.information[free][:, columns[name]]
+        return deviation**2 * (response @ response.mT)[: system.poses, : system.poses]
+
     def wanted(
         self, allowed: Collection[str], refined: Sequence[str] = (), failed: Sequence[tuple[str, ...]] = ()
     ) -> tuple[str, ...]:

@@ -37,7 +37,7 @@ _WRONG_SIGMAS = 6.0
 """Error of a length, in its standard deviations, from which on a keypoint of its ends is simply wrong."""
 
 
-def accepted(ended: Adjustment, noise: Tensor, ruler: Tensor) -> Acceptance | None:
+def accepted(ended: Adjustment, noise: Tensor, ruler: Tensor, by_focal_m: float = torch.nan) -> Acceptance | None:
     """The acceptance test of one session; None where no camera was estimated or no point is known.
 
     Args:
@@ -45,6 +45,8 @@ def accepted(ended: Adjustment, noise: Tensor, ruler: Tensor) -> Acceptance | No
         noise: covariance of the cameras' tangents and unknowns by the errors of the keypoints.
         ruler: the covariance that the errors of the sticks' given lengths add. It is no part of a length's deviation from the
             given one, but of that from the true one.
+        by_focal_m: by how much cameras are misplaced where each given focal length is wrong by 1 %, metres; NaN where these
+            were estimated.
     """
     part = ended.within(_MOST_FRAMES)
     kept = part.kept
@@ -63,6 +65,7 @@ def accepted(ended: Adjustment, noise: Tensor, ruler: Tensor) -> Acceptance | No
         reprojection_mrad=residual.rms_mrad,
         ray_distance_m=residual.ray_distance_m,
         left_out_px=residual.left_out_px,
+        by_focal_m=by_focal_m,
     )
 
 

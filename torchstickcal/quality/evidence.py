@@ -19,6 +19,7 @@ from torchstickcal.model.state import State
 from torchstickcal.model.unknowns import all_unknowns
 from torchstickcal.observations import Observations
 from torchstickcal.pipeline.adjust import Adjustment
+from torchstickcal.pipeline.check import CameraCheck
 from torchstickcal.pipeline.synchronise import ClockEstimate
 from torchstickcal.quality.acceptance import accepted
 from torchstickcal.quality.linear import FramePulls
@@ -68,6 +69,7 @@ class Evidence:
         unsynchronised: says whether the motion contradicts the clocks, which were not estimated.
         left_out: names of the cameras that are no part of the rig.
         config: the configuration.
+        check: of the given lenses and clocks; None where cameras are given.
         start_contradicted: whether poses were given as a start that the keypoints contradict.
     """
 
@@ -79,6 +81,7 @@ class Evidence:
     unsynchronised: Callable[[], bool]
     left_out: tuple[str, ...]
     config: Config
+    check: CameraCheck | None = None
     start_contradicted: bool = False
 
     @property
@@ -341,7 +344,15 @@ class Evidence:
     @cached_property
     def acceptance(self) -> Acceptance | None:
         """Errors in millimetres; None where nothing can be tested."""
-        return accepted(self.ended, self.noise, self.ruler)
+        return accepted(self.ended, self.noise, self.ruler, self._by_focal_m)
+
+    @property
+    def _by_focal_m(self) -> float:
+        """By how much cameras are misplaced where each given focal length is wrong by 1 %; NaN where these were estimated."""
+        if self.check is None or self.unknowns["focal"].refined:
+            return torch.nan
+        covariances = centre_covariances(self.centres, self.check.tangents_by("focal", 0.01))[1:]
+        return float(covariances.diagonal(dim1=1, dim2=2).sum(1).mean().sqrt())
 
 
 def without_depth(points: Tensor, centres: Tensor, seen: Tensor) -> Tensor:

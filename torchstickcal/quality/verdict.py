@@ -83,9 +83,12 @@ class Acceptance:
     left_out_px: tuple[float, ...]
     """root mean square distance between the keypoints of each camera and the points of all others, pixels; NaN where there are
     no others"""
+    by_focal_m: float = math.nan
+    """root mean square distance by which cameras are misplaced, relative to the first one, where each given focal length is
+    wrong by 1 %, metres; their standard deviations do not contain it. NaN where focal lengths were estimated"""
 
     def __post_init__(self) -> None:
-        for name in ("metre_m", "calibration_share", "reprojection_px", "reprojection_mrad", "ray_distance_m"):
+        for name in ("metre_m", "calibration_share", "reprojection_px", "reprojection_mrad", "ray_distance_m", "by_focal_m"):
             value = getattr(self, name)
             object.__setattr__(self, name, value if math.isfinite(value) else math.nan)
 
@@ -98,6 +101,16 @@ class Acceptance:
         return (
             f"A length of 1 m measured here is right to ± {1000 * self.metre_m:.3g} mm (95 %): {calibration} % calibration, "
             f"{100 - calibration} % keypoints."
+        )
+
+    @property
+    def focal_sentence(self) -> str:
+        """What wrong intrinsics would do, in one sentence; empty where focal lengths were estimated."""
+        if math.isnan(self.by_focal_m):
+            return ""
+        return (
+            "The std of the cameras takes the given focal lengths as right: if they are wrong by 1 %, cameras are misplaced by "
+            f"about {1000 * self.by_focal_m:.2g} mm."
         )
 
 
@@ -166,7 +179,7 @@ class Quality:
         given = content["acceptance"]
         if given is None:
             return Quality(findings)
-        values = {field.name: given[field.name] for field in fields(Acceptance)}
+        values = {field.name: given.get(field.name) for field in fields(Acceptance)}
         numbers = {name: _number(value) for name, value in values.items() if name not in ("lengths", "left_out_px")}
         lengths = tuple(_length_errors(one) for one in values["lengths"])
         return Quality(findings, Acceptance(lengths=lengths, left_out_px=tuple(map(_number, values["left_out_px"])), **numbers))

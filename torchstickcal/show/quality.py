@@ -58,6 +58,8 @@ def _accepted(acceptance: Acceptance) -> list[str]:
     known = [px for px in acceptance.left_out_px if px == px]
     if known:
         lines.append(f"each camera predicted by the others: {', '.join(f'{px:.2f}' for px in acceptance.left_out_px)} px")
+    if acceptance.focal_sentence:
+        lines.append(acceptance.focal_sentence)
     return [part for line in lines for part in wrapped(line)]
 
 

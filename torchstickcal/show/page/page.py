@@ -190,7 +190,7 @@ def _acceptance(acceptance: Acceptance) -> str:
     text += (
         f"<p>Projections lie {digits(acceptance.reprojection_px)} px (rms), {digits(acceptance.reprojection_mrad)} mrad, from "
         f"their keypoints; rays pass their points at {digits(1000 * acceptance.ray_distance_m)} mm (median)."
-        f"{left_out}</p></section>"
+        f"{left_out} {escape(acceptance.focal_sentence)}</p></section>"
     )
     return text
 
