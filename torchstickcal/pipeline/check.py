@@ -132,6 +132,12 @@ class CameraCheck:
         deviation, variance = unknowns.by_name(values[None])[name][0], unknowns.variances(covariance)[name]
         return Suggestion(deviation, variance.sqrt())
 
+    def suggestion_for_all(self, variant: str) -> tuple[Tensor, Tensor]:
+        """What the keypoints suggest for an unknown that cameras share, by its variant: values (K,) as deviations, and their
+        standard deviations (K,)."""
+        _, values, covariance = self._solved((variant,))
+        return values, covariance.diagonal().sqrt()
+
     def wanted(
         self, allowed: Collection[str], refined: Sequence[str] = (), failed: Sequence[tuple[str, ...]] = ()
     ) -> tuple[str, ...]:

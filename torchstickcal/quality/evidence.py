@@ -17,6 +17,7 @@ from torchstickcal.model.state import State
 from torchstickcal.model.unknowns import all_unknowns
 from torchstickcal.observations import Observations
 from torchstickcal.pipeline.adjust import Adjustment
+from torchstickcal.pipeline.check import CameraCheck
 from torchstickcal.pipeline.synchronise import ClockEstimate
 from torchstickcal.quality.acceptance import accepted
 from torchstickcal.quality.linear import FramePulls
@@ -62,6 +63,7 @@ class Evidence:
         left_out: names of the cameras that are no part of the rig.
         config: the configuration.
         start_contradicted: whether poses were given as a start that the keypoints contradict.
+        check: what the keypoints say of lenses and clocks; None where that is not asked.
     """
 
     ended: Adjustment
@@ -73,6 +75,7 @@ class Evidence:
     left_out: tuple[str, ...]
     config: Config
     start_contradicted: bool = False
+    check: CameraCheck | None = None
 
     @property
     def observations(self) -> Observations:
@@ -165,6 +168,15 @@ class Evidence:
         far = (wanted / focal.given).clamp_min(1e-3).log().abs() > _NEAR_FOCAL
         known = self.observations.intrinsics_known
         return far & (self.contradictions["focal"] > _FAR_SIGMAS**2) if known else torch.zeros_like(far)
+
+    @cached_property
+    def common_focal(self) -> tuple[float, float] | None:
+        """Logarithm of the factor on all focal lengths that the keypoints suggest, and its standard deviation; None where focal
+        lengths were estimated, or are those of several groups."""
+        if self.check is None or any(name.startswith("focal") for name in self.ended.refined):
+            return None
+        values, stds = self.check.suggestion_for_all("focal_shared")
+        return (float(values), float(stds)) if len(values) == 1 else None
 
     @cached_property
     def off_centre(self) -> Tensor:
