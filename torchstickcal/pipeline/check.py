@@ -154,6 +154,12 @@ class CameraCheck:
         response = covariance_of(system.information[free][:, free]) @ system.information[free][:, columns[name]]
         return deviation**2 * (response @ response.mT)[: system.poses, : system.poses]
 
+    def suggestion_for_all(self, variant: str) -> tuple[Tensor, Tensor]:
+        """What the keypoints suggest for an unknown that cameras share, by its variant: values (K,) as deviations, and their
+        standard deviations (K,)."""
+        _, values, covariance = self._solved((variant,))
+        return values, covariance.diagonal().sqrt()
+
     def wanted(
         self, allowed: Collection[str], refined: Sequence[str] = (), failed: Sequence[tuple[str, ...]] = ()
     ) -> tuple[str, ...]:

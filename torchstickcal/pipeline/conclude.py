@@ -102,7 +102,7 @@ def evidence_of(
     noise, ruler = _covariances(ended, config)
     tangents = 6 * (ended.measurements.num_cameras - 1)
     unknowns = _unknowns(ended, check, (noise + ruler)[tangents:, tangents:])
-    return Evidence(ended, unknowns, noise, ruler, clocks, unsynchronised, left_out, config, check, start_contradicted)
+    return Evidence(ended, unknowns, noise, ruler, clocks, unsynchronised, left_out, config, start_contradicted, check)
 
 
 def keypoint_index(ended: Adjustment) -> Tensor:

@@ -69,8 +69,8 @@ class Evidence:
         unsynchronised: says whether the motion contradicts the clocks, which were not estimated.
         left_out: names of the cameras that are no part of the rig.
         config: the configuration.
-        check: of the given lenses and clocks; None where cameras are given.
         start_contradicted: whether poses were given as a start that the keypoints contradict.
+        check: what the keypoints say of lenses and clocks; None where the cameras were given.
     """
 
     ended: Adjustment
@@ -81,8 +81,8 @@ class Evidence:
     unsynchronised: Callable[[], bool]
     left_out: tuple[str, ...]
     config: Config
-    check: CameraCheck | None = None
     start_contradicted: bool = False
+    check: CameraCheck | None = None
 
     @property
     def observations(self) -> Observations:
@@ -185,6 +185,15 @@ class Evidence:
         far = (wanted / focal.given).clamp_min(1e-3).log().abs() > _NEAR_FOCAL
         known = self.observations.intrinsics_known
         return far & (self.contradictions["focal"] > _FAR_SIGMAS**2) if known else torch.zeros_like(far)
+
+    @cached_property
+    def common_focal(self) -> tuple[float, float] | None:
+        """Logarithm of the factor on all focal lengths that the keypoints suggest, and its standard deviation; None where focal
+        lengths were estimated, or are those of several groups."""
+        if self.check is None or any(name.startswith("focal") for name in self.ended.refined):
+            return None
+        values, stds = self.check.suggestion_for_all("focal_shared")
+        return (float(values), float(stds)) if len(values) == 1 else None
 
     @cached_property
     def off_centre(self) -> Tensor:

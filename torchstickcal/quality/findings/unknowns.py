@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 
 import torch
@@ -28,6 +29,8 @@ _ANOTHER_CAMERA = 0.3
 _FAR_FOCAL, _FAR_SIGMAS = 0.03, 3.0
 """Error of a focal length that no careful calibration makes, from which on less evidence is enough, where the errors of the
 keypoints are not always the same."""
+_UNSEEN_FOCAL = 0.05
+"""Error of all focal lengths from which on it is said that the keypoints would not show it."""
 _IN_STEP_FRAMES = 0.15
 _IN_COMMON_SHARE, _LITTLE_IN_COMMON_SHARE = 0.6, 0.5
 _WRONG_FRAMES = 0.5
@@ -41,6 +44,10 @@ def unknowns(evidence: Evidence) -> Iterator[Finding]:
         yield from _contradicted(evidence, unknown, evidence.unknowns[name])
         yield from _different(evidence, unknown, evidence.unknowns[name])
         yield from _undetermined(evidence, unknown, evidence.unknowns[name])
+    if evidence.observations.intrinsics_known and not any(
+        _contradicted(evidence, all_unknowns()["focal"], evidence.unknowns["focal"])
+    ):
+        yield from _all_focals(evidence)
 
 
 @findings("clocks", "cameras whose clocks are apart or uncertain, by the motion in the images")
@@ -131,6 +138,38 @@ def _contradicted(evidence: Evidence, unknown: CameraUnknown, parameter: CameraP
             limit=limit,
             unit="standard deviations",
             is_cause=matters and evidence.explains_most(unknown.family),
+        )
+
+
+def _all_focals(evidence: Evidence) -> Iterator[Finding]:
+    """Focal lengths that are all wrong by the same factor: several cameras together say more than each by itself."""
+    if evidence.common_focal is None:
+        return
+    wanted, std = evidence.common_focal
+    change, names = math.expm1(wanted), evidence.observations.camera_labels
+    if abs(change) > _FAR_FOCAL and abs(wanted) > _FAR_SIGMAS * std:
+        yield Finding(
+            "focal_contradicted",
+            Severity.SERIOUS if abs(wanted) > _CONTRADICTED_SIGMAS * std else Severity.CAUTION,
+            f"All focal lengths together: the keypoints suggest {100 * change:+.1f} ± {100 * std:.1f} %, compared with the given "
+            "ones, which were used.",
+            "Check them, or estimate their common factor (refine 'focal_shared').",
+            cameras=names,
+            figure=wanted / std,
+            limit=_FAR_SIGMAS,
+            unit="standard deviations",
+            is_cause=evidence.explains_most("lens"),
+        )
+    elif (unseen := _FAR_SIGMAS * std) > _UNSEEN_FOCAL:
+        yield Finding(
+            "focal_unchecked",
+            Severity.NOTE,
+            f"The keypoints would not show focal lengths that are all wrong by up to {100 * min(unseen, 1.0):.0f} %. The "
+            "distances of the cameras from the athlete would be wrong by about as much; their std does not contain that.",
+            "Calibrate the lenses with care, or record more frames, in which the athlete moves and turns.",
+            figure=unseen,
+            limit=_UNSEEN_FOCAL,
+            unit="share",
         )
 
 
