@@ -243,24 +243,6 @@ class TestBall:
         discs = discs_of(patches, [np.array([1.0, 0])] * len(radii), np.zeros((len(radii), 2)), 6)
         assert [disc is None for disc in discs] == [radius < 5 for radius in radii]
 
-    @pytest.mark.parametrize(
-        ("last_px", "last_radius", "lower"),
-        [(60.0, 7.0, True), (120.0, 7.0, False), (86.0, 5.0, False)],
-        ids=["turns towards the camera", "turns across", "goes away from the camera"],
-    )
-    def test_a_stick_that_points_at_the_camera_has_lower_scores(self, last_px: float, last_radius: float, lower: bool):
-        lengths, radii = np.linspace(120.0, last_px, 30), np.linspace(7.0, last_radius, 30)
-        tracks = [TapeTrack(), TapeTrack()]
-        for length, radius in zip(lengths, radii, strict=True):
-            patch = self.seen((30.0, 30.0), np.zeros(2), radius=radius)
-            for track, shift in zip(tracks, (0, round(length)), strict=True):
-                there = Patch(patch.shares, patch.other, (shift, 0))
-                track.add([Candidate(30.0 + shift, 30.0, float(patch.shares.sum()), 2 * radius, 0.0, there)])
-        for ends in ends_of(tracks, balls=True):
-            change = ends[-1, 2] / ends[0, 2]
-            size = (last_radius / 7.0) ** 2  # a smaller ball is known less well
-            assert (change < 0.35 * size) == lower
-
     def test_balls_in_videos(self, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
         frames = [picture((30.0 + 8 * k, 60, YELLOW), (30.0 + 8 * k, 150, RED), radius=6.0, blur_px=3.0) for k in range(20)]
         path = written(tmp_path / "a.mp4", frames, 60.0)
