@@ -460,6 +460,23 @@ class TestNotFound:
         assert [row["event"] for row in rows if row["figure"] == "not_found"] == list(missing)
         assert curves_picture(found).get_suptitle().count("found") == len(missing)
 
+    def test_turns_are_not_spoken_of_where_there_are_none(self, golf):
+        part = self.part(golf[0], slice(60, None))
+        sticks = (replace(part.sticks[0], start=0, end=1),)
+        names = ("butt", "tip")
+        alone = replace(
+            part,
+            points=part.points[:, -2:],
+            residuals_px=part.residuals_px[:, :, -2:],
+            inliers=part.inliers[:, :, -2:],
+            sigma_px=part.sigma_px[-2:],
+            point_names=names,
+            sticks=sticks,
+        )
+        notes = analyse(alone, "golf", draws=2).notes
+        assert any("no address found" in note for note in notes)
+        assert not any("Turns of" in note for note in notes)
+
     def test_a_whole_swing_has_no_such_note(self, golf_analysis):
         assert golf_analysis.swings[0].not_found == ()
         assert not any("found" in note for note in golf_analysis.notes)

@@ -63,6 +63,21 @@ def codes(quality: Quality) -> list[str]:
     return [finding.code for finding in quality.findings]
 
 
+@pytest.mark.parametrize("stick_alone", [True, False])
+def test_sticks_alone_do_not_say_that_the_athlete_is_small(stick_alone: bool):
+    given = session(cameras=3, frames=30).observations
+    ends = list(given.sticks[0].ends)
+    points = ends if stick_alone else list(range(given.keypoints.shape[2]))
+    few = Observations(
+        given.keypoints[:, :, points],
+        given.intrinsics,
+        Stick(points.index(ends[0]), points.index(ends[1]), given.sticks[0].length_m),
+        image_size=(19200, 10800),
+        fps=given.fps,
+    )
+    assert ("athlete_small" in codes(calibrate(few).quality)) != stick_alone
+
+
 @pytest.mark.parametrize(("sport", "cameras"), [("golf", 3), ("kendo", 6)])
 def test_a_sound_session_is_good(sport: str, cameras: int):
     calibration = calibrate(session(sport, cameras).observations)

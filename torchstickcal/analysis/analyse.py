@@ -165,7 +165,7 @@ def analysis_of(tracks: Tracks, sport: str, rules: Sport, stick: int, draws: int
         swings=swings,
         repeated=_repeated(tracks.times, stacked, units, events),
         sport=sport,
-        notes=(*tracks.notes, *notes, *_about_swings(swings)),
+        notes=(*tracks.notes, *notes, *_about_swings(swings, any(ANGLES[name].turns for name in angles))),
     )
 
 
@@ -313,8 +313,8 @@ def _std(values: Array) -> Array:
     return np.where(count >= (1 - _MOST_UNKNOWN) * len(squares), np.sqrt(mean), np.nan)
 
 
-def _about_swings(swings: Sequence[Swing]) -> list[str]:
-    """Sentences about swings and events that were not found, and what has no value for this reason."""
+def _about_swings(swings: Sequence[Swing], with_turns: bool) -> list[str]:
+    """Sentences about swings and events that were not found, and what has no value or another meaning for this reason."""
     if not swings:
         return ["No swing was found: the stick is not known in enough frames."]
     notes = []
@@ -324,6 +324,6 @@ def _about_swings(swings: Sequence[Swing]) -> list[str]:
         notes += [f"Swing {number}: without a value are {', '.join(unknown)}."] if unknown else []
     if any(swing.not_found for swing in swings):
         notes.append("Let the recording begin a second before the first swing and end a second after the last one.")
-    if all("takeaway" in swing.not_found for swing in swings):
+    if with_turns and all("takeaway" in swing.not_found for swing in swings):
         notes.append("Turns of trunk and pelvis are counted from the first frame, because no takeaway was found.")
     return notes

@@ -133,7 +133,8 @@ class StickSmoother:
         near = np.stack([_seen_from(alone, *alone(ends[None], np.array([length_m])), offset)[0] for offset in offsets])
         noise = np.stack([_noise_from(alone, offset) for offset in offsets])
         noise[~np.isfinite(near).all(-1)] = np.nan
-        near[~np.stack([shifted(whole[:, None, None] * 1.0, offset)[:, 0, 0] == 1 for offset in offsets])] = np.nan
+        whole_there = np.stack([shifted(whole[:, None, None] * 1.0, offset)[:, 0, 0] for offset in offsets]) == 1
+        near[~whole_there] = np.nan
         own = np.where(np.isfinite(near), np.diagonal(noise, axis1=2, axis2=3), np.nan)
         motions = [_Motion.likeliest(near[..., part], own[..., part].mean(-1), step) for part in (_PLACE, _TURN)]
         apart = np.stack([offsets_s(tracks.times, offset) for offset in offsets])

@@ -296,11 +296,7 @@ def _centres(
     own = chosen[number]
     others = [[track[frame] for k, track in enumerate(chosen) if k != number] for frame in range(len(own))]
     axes = [None if c is None else _axis(c, seen, near) for c, seen, near in zip(own, others, hands, strict=True)]
-    if balls:
-        by_mark = np.array([any(other is not None for other in seen) for seen in others], dtype=bool)
-        ends = _by_discs(own, axes, by_mark)
-    else:
-        ends = _by_symmetry(own, axes)
+    ends = _by_discs(own, axes) if balls else _by_symmetry(own, axes)
     unclear = np.array([axis is None for axis in axes]) & (len(chosen) > 1)
     ends[:, 2] = np.where(unclear, _LEAST_SCORE, np.clip(ends[:, 2], _LEAST_SCORE, 1.0))
     ends[np.isnan(ends[:, 0]), 2] = 0.0
@@ -323,12 +319,9 @@ def _by_symmetry(own: Sequence[Candidate | None], axes: Sequence[Array | None]) 
     return ends
 
 
-def _by_discs(own: Sequence[Candidate | None], axes: Sequence[Array | None], by_mark: NDArray[np.bool_]) -> Array:
-    """Centres and scores (F, 3) of a ball: of the discs that fit its outline.
-
-    The score is how well the outline determines the centre, as a variance relative to the best frames, times the squared share
-    of the stick's length that is seen. ``by_mark`` (F,) is whether an axis ends at another mark.
-    """
+def _by_discs(own: Sequence[Candidate | None], axes: Sequence[Array | None]) -> Array:
+    """Centres and scores (F, 3) of a ball: of the discs that fit its outline. The score is how well the outline determines the
+    centre, as a variance relative to the best frames."""
     patches = [
         None if c is None or c.patch is None or (axis is not None and c.patch.is_covered(axis)) else c.patch
         for c, axis in zip(own, axes, strict=True)
@@ -338,22 +331,7 @@ def _by_discs(own: Sequence[Candidate | None], axes: Sequence[Array | None], by_
     known = np.isfinite(ends[:, 2])
     if known.any():
         ends[:, 2] /= np.percentile(ends[known, 2], 90)
-    radii = np.array([np.nan if disc is None else disc.radius_px for disc in discs])
-    lengths = np.array([np.nan if axis is None else np.linalg.norm(axis) for axis in axes]) / radii
-    for seen in (by_mark, ~by_mark):
-        ends[seen, 2] *= _seen_across(lengths[seen]) ** 2
     return ends
-
-
-def _seen_across(lengths: Array) -> Array:
-    """Shares (n,) of the stick's length that are seen: what lies along the line of sight is not. 1 where not known.
-
-    Args:
-        lengths: (n,), of the stick in the images, in radii of its ball, so that the distance from the camera does not matter.
-    """
-    known = np.isfinite(lengths)
-    whole = np.percentile(lengths[known], 95) if known.any() else 1.0
-    return np.where(known, np.minimum(lengths / whole, 1.0), 1.0)
 
 
 def _streaks(own: Sequence[Candidate | None]) -> Array:
