@@ -17,10 +17,12 @@ from torchstickcal.solvers.acceleration import Acceleration
 from torchstickcal.solvers.linearised import Linearised, Tangent, gradient_at
 
 _MAX_ROUNDS = 40
-_TO_ROUNDING, _NEAR, _IN_FLOAT32 = (1e-8, 1e-8), (1e-4, 1e-7), (1e-3, 1e-6)
+_TO_ROUNDING, _NEAR, _IN_FLOAT32 = (1e-8, 1e-9), (1e-4, 1e-7), (1e-3, 1e-6)
 """Length of a step, in standard deviations of the estimate, below which it is the last, and what the last step may leave, by
 how much shorter it is than the one before: for a minimum up to rounding errors, near enough for everything but gradients, and
 as near as float32 allows. The first step is no measure of that: it corrects what the solver has left."""
+_POINTS_ALONE = 10.0
+"""So many times as much may be left where the cameras are held: what is left of points is small in metres, too."""
 _FAR_SIGMAS, _FAR_FROM_NEAR_SIGMAS = 1e-4, 1e-2
 """The same, above which steps that do not become shorter any more say that there is no minimum: rounding errors are smaller."""
 _SLOW, _OLD = 0.3, 3
@@ -59,6 +61,7 @@ def minimum_near(
     objective, gradient, age, age_of_step, back = at.objective, at.gradient, 0, 0, False
     is_double = objective.measurements.pixels.dtype == torch.float64
     tolerance, remaining = _IN_FLOAT32 if not is_double else _TO_ROUNDING if to_rounding else _NEAR
+    remaining = remaining if cameras_free else _POINTS_ALONE * remaining
     far = _FAR_SIGMAS if is_double and to_rounding else _FAR_FROM_NEAR_SIGMAS
     before = shortest = torch.full_like(state.points[:, 0, 0], torch.inf)
     moving = torch.ones_like(shortest, dtype=torch.bool)
