@@ -155,7 +155,9 @@ def error_correlation(
     squares = (common.square() * widths).sum(1, keepdim=True)
     lasting = 1 + 2 * (common * widths).sum(1, keepdim=True).square() / squares.clamp_min(1e-12)
     counts = (numbers / time.clamp_max(m.frames), numbers / lasting.clamp_max(m.frames))
-    amplitudes, nothing = _amplitudes(products, pairs, common, *counts, contrast, nothing)
+    ends = torch.zeros_like(values[0, :, 0], dtype=torch.bool)
+    ends[m.sticks.flatten()] = True
+    amplitudes, nothing = _amplitudes(products, pairs, common, *counts, ends, contrast, nothing)
     values[..., 1:] = (amplitudes[..., None] * common[:, None]).clamp(0.0, 1.0)[..., bins]
     return ErrorCorrelation(values, CorrelationGates(significant, nothing))
 
@@ -254,10 +256,11 @@ def _amplitudes(
     common: Tensor,
     independent: Tensor,
     independent_lasting: Tensor,
+    ends: Tensor,
     contrast: float,
     nothing: Tensor | None,
 ) -> tuple[Tensor, Tensor]:
-    """How much of the common correlation (B, bins) each point has, (B, P), drawn towards that of all points; and who has none.
+    """How much of the common correlation (B, bins) each point has, (B, P), drawn towards that of all joints; and who has none.
 
     It is a variance, that of the errors that last, estimated from few independent ones. So its logarithm is drawn towards the
     mean, as that of the noise is. A point that has none where others clearly have some gets
@@ -269,6 +272,7 @@ def _amplitudes(
         common: the correlation of all points together.
         independent: (B, P), number of independent errors that each point has had.
         independent_lasting: (B, P), the same of what lasts of them.
+        ends: (P,), the ends of sticks. They are points of another kind, and too few to have a mean: they keep what they show.
         contrast: variance of the logarithms between points that is taken for granted.
         nothing: (B, P), the points that have none; None to decide.
     """
@@ -282,5 +286,5 @@ def _amplitudes(
     half = independent_lasting.clamp_min(1.0) / 2  # degrees of freedom of a variance, whose logarithm is too small in the mean
     sampling = by_chance / own.square() + torch.polygamma(1, half)
     logarithms = own.log() - (torch.digamma(half) - half.log())
-    drawn = shrunk_logarithms(logarithms, sampling, independent > 0, contrast, _FARTHEST).exp()
-    return drawn.where(~nothing, _MEAN_BY_CHANCE * by_chance.sqrt()), nothing
+    drawn = shrunk_logarithms(logarithms, sampling, (independent > 0) & ~ends, contrast, _FARTHEST).exp()
+    return torch.where(ends, own, drawn).where(~nothing, _MEAN_BY_CHANCE * by_chance.sqrt()), nothing
