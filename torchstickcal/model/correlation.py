@@ -142,8 +142,7 @@ def error_correlation(
     free = _freedom_share(m)
     products, pairs = free[..., None] * products, free[..., None] * pairs
     held = None if gates is None else gates.significant
-    widths = bins.bincount()
-    common, time, significant = _pooled(products.sum(1), pairs.sum(1), widths, held)
+    common, time, significant = _pooled(products.sum(1), pairs.sum(1), bins.bincount(), held)
     if gates is None:
         gates = CorrelationGates(significant, torch.zeros_like(values[..., 0], dtype=torch.bool))
         if not bool(significant.any()):
@@ -151,13 +150,8 @@ def error_correlation(
         nothing = None
     else:
         nothing = gates.nothing
-    numbers = 2 * free * m.by_frame(m.visible.sum(1)).sum(1)
-    squares = (common.square() * widths).sum(1, keepdim=True)
-    lasting = 1 + 2 * (common * widths).sum(1, keepdim=True).square() / squares.clamp_min(1e-12)
-    counts = (numbers / time.clamp_max(m.frames), numbers / lasting.clamp_max(m.frames))
-    ends = torch.zeros_like(values[0, :, 0], dtype=torch.bool)
-    ends[m.sticks.flatten()] = True
-    amplitudes, nothing = _amplitudes(products, pairs, common, *counts, ends, contrast, nothing)
+    independent = 2 * free * m.by_frame(m.visible.sum(1)).sum(1) / time.clamp_max(m.frames)
+    amplitudes, nothing = _amplitudes(products, pairs, common, independent, contrast, nothing)
     values[..., 1:] = (amplitudes[..., None] * common[:, None]).clamp(0.0, 1.0)[..., bins]
     return ErrorCorrelation(values, CorrelationGates(significant, nothing))
 
@@ -251,16 +245,9 @@ def _pooled(products: Tensor, pairs: Tensor, widths: Tensor, held: Tensor | None
 
 
 def _amplitudes(
-    products: Tensor,
-    pairs: Tensor,
-    common: Tensor,
-    independent: Tensor,
-    independent_lasting: Tensor,
-    ends: Tensor,
-    contrast: float,
-    nothing: Tensor | None,
+    products: Tensor, pairs: Tensor, common: Tensor, independent: Tensor, contrast: float, nothing: Tensor | None
 ) -> tuple[Tensor, Tensor]:
-    """How much of the common correlation (B, bins) each point has, (B, P), drawn towards that of all joints; and who has none.
+    """How much of the common correlation (B, bins) each point has, (B, P), drawn towards that of all points; and who has none.
 
     It is a variance, that of the errors that last, estimated from few independent ones. So its logarithm is drawn towards the
     mean, as that of the noise is. A point that has none where others clearly have some gets
@@ -271,8 +258,6 @@ def _amplitudes(
         pairs: their numbers, as far as they are independent, (B, P, bins).
         common: the correlation of all points together.
         independent: (B, P), number of independent errors that each point has had.
-        independent_lasting: (B, P), the same of what lasts of them.
-        ends: (P,), the ends of sticks. They are points of another kind, and too few to have a mean: they keep what they show.
         contrast: variance of the logarithms between points that is taken for granted.
         nothing: (B, P), the points that have none; None to decide.
     """
@@ -283,8 +268,6 @@ def _amplitudes(
     if nothing is None:
         nothing = (own < least) & (least < (-_SIGNIFICANT_OF_POINT * scatter.sqrt()).exp())
     own = torch.maximum(own, least).clamp_max(_LARGEST_AMPLITUDE)
-    half = independent_lasting.clamp_min(1.0) / 2  # degrees of freedom of a variance, whose logarithm is too small in the mean
-    sampling = by_chance / own.square() + torch.polygamma(1, half)
-    logarithms = own.log() - (torch.digamma(half) - half.log())
-    drawn = shrunk_logarithms(logarithms, sampling, (independent > 0) & ~ends, contrast, _FARTHEST).exp()
-    return torch.where(ends, own, drawn).where(~nothing, _MEAN_BY_CHANCE * by_chance.sqrt()), nothing
+    sampling = by_chance / own.square() + scatter
+    drawn = shrunk_logarithms(own.log(), sampling, independent > 0, contrast, _FARTHEST).exp()
+    return drawn.where(~nothing, _MEAN_BY_CHANCE * by_chance.sqrt()), nothing
