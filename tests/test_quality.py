@@ -242,6 +242,24 @@ def test_every_keypoint_is_used_or_set_aside():
     assert sum(counts) + others == int(observations.visible.sum() - calibration.inliers.sum())
 
 
+def test_keypoints_that_contradict_are_counted_where_labels_were_exchanged_and_some_are_missing():
+    given = session(cameras=3, frames=40)
+    names = given.observations.point_names
+    assert names is not None
+    left, right = ([names.index(f"{side}_{joint}") for joint in ("knee", "ankle", "wrist")] for side in ("left", "right"))
+    keypoints = given.observations.keypoints.clone()
+    keypoints[:, ::2, left[0]] = torch.nan
+    keypoints[:, 1::2, right[0]] = torch.nan
+    for one, other in [(names.index(name), names.index(name.replace("left", "right"))) for name in names if "left" in name]:
+        keypoints[1, 10:30, [one, other]] = keypoints[1, 10:30, [other, one]]
+    calibration = calibrate(replace(given.observations, keypoints=keypoints))
+    assert bool(calibration.relabelled[1, 10:30].any())
+    seen = keypoints.isfinite().all(-1).gather(2, calibration.keypoint_index)
+    contradict = int((seen & (seen.sum(0) > 1)).sum() - calibration.inliers.sum())
+    said = [finding for finding in calibration.quality.findings if finding.code == "keypoints_rejected"]
+    assert [int(finding.meaning.split(" ")[0]) for finding in said] == [contradict] * bool(contradict)
+
+
 @pytest.mark.parametrize(("camera", "sport", "seed"), [(2, "hockey", 8)])
 def test_another_recording_in_one_of_three_cameras_is_named(camera: int, sport: str, seed: int):
     """The points give way to it: it makes noise, and few of its keypoints disagree."""

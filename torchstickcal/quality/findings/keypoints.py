@@ -99,7 +99,7 @@ def _used(evidence: Evidence) -> Iterator[Finding]:
     observations, ended = evidence.observations, evidence.ended
     frames, measurements = ended.frames[0], ended.measurements
     seen = observations.visible & ~frames.to_own(ended.labels.other_person[0], False)[..., None]
-    compared = frames.to_own(measurements.by_frame(measurements.visible[0]), False) & seen
+    compared = frames.to_own(measurements.by_frame(measurements.visible[0]), False)
     used = frames.to_own(measurements.by_frame(ended.last.inliers[0]), False)
     total, alone = int(observations.visible.sum()), int(seen.sum() - compared.sum())
     if alone:
