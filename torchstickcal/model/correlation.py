@@ -22,8 +22,6 @@ _CUT = 3.0
 _SIGNIFICANT = 3.0
 """Estimate, in standard deviations, from which on a correlation of all points together is taken as real; of one point, 2."""
 _SIGNIFICANT_OF_POINT = 2.0
-_STILL_SHARE = 0.5
-"""Correlation, over that of the bin before, from which on it counts as alike."""
 _BIN_SHARE = 0.25
 """Width of a bin of lags, as a share of the lag."""
 _LEAST_PAIRS = 30
@@ -211,8 +209,7 @@ def _freedom_share(m: Measurements) -> Tensor:
 
 def _pooled(products: Tensor, pairs: Tensor, widths: Tensor, held: Tensor | None) -> tuple[Tensor, Tensor, Tensor]:
     """The correlation of all points together by bin that chance does not explain, (B, bins), and its integrated time (B, 1);
-    also in which bins there is such a correlation, (B, bins). At lags so large that chance would explain a correlation as at
-    smaller lags, one that is found and much alike is taken as real.
+    also in which bins there is such a correlation, (B, bins).
 
     The sampling variance of a bin is one over its pairs where errors are independent. Where they last, the products at
     neighbouring lags are alike too (Bartlett's formula), by what was found at smaller lags.
@@ -232,10 +229,7 @@ def _pooled(products: Tensor, pairs: Tensor, widths: Tensor, held: Tensor | None
         one = slice(number, number + 1)
         variance = torch.minimum(time.square(), width * squares) / pairs[:, one].clamp_min(0.1)
         found = products[:, one] / pairs[:, one].clamp_min(0.1)
-        chance = _SIGNIFICANT * variance.sqrt()
-        above = found > chance if held is None else held[:, one]
-        if number and held is None:
-            above = above | ((values[-1] < chance) & (values[-1] > 0) & (found > _STILL_SHARE * values[-1]))
+        above = found > _SIGNIFICANT * variance.sqrt() if held is None else held[:, one]
         enough = pairs[:, one] >= _LEAST_PAIRS if number else torch.ones_like(above)
         found = found.where(above, 0.0).clamp(0.0, 1.0)
         values.append(found if not number else found.where(enough, values[-1]))
