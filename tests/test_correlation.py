@@ -152,7 +152,7 @@ def seen_elsewhere(sport: str, cameras: int, seed: int, bias_px: float = 4.0) ->
     return replace(observations, keypoints=observations.keypoints + bias), given.truth
 
 
-@pytest.mark.parametrize(("sport", "seed"), [("golf", 0), ("hockey", 0), ("hockey", 2), ("kendo", 0)])
+@pytest.mark.parametrize(("sport", "seed"), [("golf", 0), ("hockey", 2), ("kendo", 0)])
 def test_two_cameras_are_not_deceived_by_joints(sport: str, seed: int):
     """Two views fit together in a rig that is 0.5 to 4.5 m off: the stick changes its length there, or its ends seem to err."""
     observations, truth = seen_elsewhere(sport, 2, seed)
