@@ -16,12 +16,15 @@ from torchstickcal.geometry import triangulation
 from torchstickcal.geometry.triangulation import triangulate, triangulate_robustly
 from torchstickcal.model.measurements import Measurements
 from torchstickcal.model.state import State
-from torchstickcal.pipeline.adjust import adjust_cameras, begin
+from torchstickcal.pipeline import adjust
+from torchstickcal.pipeline.adjust import Adjustment, adjust_cameras, begin
 from torchstickcal.pipeline.initialise import initialise
 from torchstickcal.pipeline.initialise.graph import Edge, propagate, spanning_tree
 from torchstickcal.pipeline.initialise.pairs import Pair, RelativePose, relate
 from torchstickcal.pipeline.initialise.views import Views
 from torchstickcal.pipeline.run import Run
+from torchstickcal.pipeline.selection import ModelSelection
+from torchstickcal.quality.handedness import mirrored_share
 from torchstickcal.simulate import Lens, Noise, SessionSpec, golf_session
 
 
@@ -219,6 +222,31 @@ def test_a_start_with_reversed_depths_is_left(seed: int):
     found, truth = ended.state, case.truth
     errors = metrics.pose_errors(found.rotations[0], found.translations[0], truth.rotations, truth.translations)
     assert errors.mean_rotation_deg < 10  # on the wrong side it is more than 90
+
+
+@pytest.mark.parametrize("sport", ["golf", "kendo"])
+def test_a_reversed_scene_is_turned_back_where_the_body_says_so(sport: str, monkeypatch: pytest.MonkeyPatch):
+    case = SessionSpec("s", sport, seed=1, cameras=3, frames=40, lens=Lens(), regimes=(Noise(2.0),)).generate()
+    given = case.observations
+    selection = ModelSelection(given, run := Run(load_config("default")))
+    sound, _ = selection.adjusted(None)
+    reverse = replace(sound[0], state=sound.state.depth_reversed(sound.measurements.active))
+    with monkeypatch.context() as patched:
+        patched.setattr(adjust, "_on_the_right_side", lambda stages, ended, run: ended)
+        wrong = adjust_cameras(reverse, run)
+
+    def error_deg(found: Adjustment) -> float:
+        rotations, translations = found.state.rotations[0], found.state.translations[0]
+        return metrics.pose_errors(rotations, translations, case.truth.rotations, case.truth.translations).mean_rotation_deg
+
+    assert error_deg(wrong) > 45
+    assert error_deg(selection._turned_back(wrong)) < 2
+    assert selection._turned_back(sound) is sound
+    across = torch.tensor([-1.0, 1.0], dtype=given.keypoints.dtype)
+    mirrored = replace(given, keypoints=given.keypoints * across + (1 - across) * given.intrinsics[0, 0, 2])
+    ended, _ = ModelSelection(mirrored, run).adjusted(None)
+    assert mirrored_share(ended.measurements.by_frame(ended.state.points[0]), given.point_names) > 0.8, "nothing to turn back"
+    assert ended.converged
 
 
 @pytest.mark.filterwarnings("ignore::torchstickcal.errors.ObservationWarning")

@@ -24,7 +24,7 @@ from torchstickcal.io import load_session, write_npz
 from torchstickcal.model.unknowns import all_unknowns
 from torchstickcal.quality.evidence import Evidence, without_depth
 from torchstickcal.quality.findings.causes import _closer
-from torchstickcal.quality.findings.unknowns import _contradicted, _different, _little_in_common
+from torchstickcal.quality.findings.unknowns import _all_focals, _contradicted, _different, _little_in_common
 from torchstickcal.quality.judge import _as_effects
 from torchstickcal.quality.lags import frames_are_apart
 from torchstickcal.quality.linear import FramePulls
@@ -186,6 +186,37 @@ def test_a_large_error_of_a_focal_length_needs_less_evidence(share: float, sigma
     )
     found = list(_contradicted(cast(Evidence, evidence), all_unknowns()["focal"], focal))
     assert [(finding.code, finding.severity) for finding in found] == said * [("focal_contradicted", Severity.SERIOUS)]
+
+
+@pytest.mark.parametrize(
+    ("wanted", "std", "said"),
+    [
+        (0.06, 0.012, [("focal_contradicted", Severity.SERIOUS)]),
+        (-0.06, 0.017, [("focal_contradicted", Severity.CAUTION)]),
+        (0.06, 0.03, [("focal_unchecked", Severity.NOTE)]),
+        (0.02, 0.004, []),
+        (0.0, 0.01, []),
+        (None, 0.0, []),
+    ],
+)
+def test_focal_lengths_that_are_all_wrong(wanted: float | None, std: float, said: list[tuple[str, Severity]]):
+    evidence = SimpleNamespace(
+        observations=session(cameras=3, frames=2).observations,
+        common_focal=None if wanted is None else (wanted, std),
+        explains_most=lambda family: True,
+    )
+    found = list(_all_focals(cast(Evidence, evidence)))
+    assert [(finding.code, finding.severity) for finding in found] == said
+
+
+def test_several_cameras_together_show_a_wrong_focal_length_that_none_shows_alone():
+    given = session(cameras=4, frames=60, sigma_px=3.0).observations
+    assert "focal_contradicted" not in codes(calibrate(given).quality)
+    longer = given.intrinsics.clone()
+    longer[:, [0, 1], [0, 1]] *= 1.06
+    found = [one for one in calibrate(replace(given, intrinsics=longer)).quality.findings if one.code == "focal_contradicted"]
+    assert found
+    assert found[0].severity > Severity.NOTE
 
 
 @pytest.mark.parametrize(("share", "severity"), [(0.7, None), (0.55, Severity.CAUTION), (0.3, Severity.SERIOUS)])

@@ -22,8 +22,6 @@ _CUT = 3.0
 _SIGNIFICANT = 3.0
 """Estimate, in standard deviations, from which on a correlation of all points together is taken as real; of one point, 2."""
 _SIGNIFICANT_OF_POINT = 2.0
-_STILL_SHARE = 0.5
-"""Correlation, over that of the bin before, from which on it counts as alike."""
 _BIN_SHARE = 0.25
 """Width of a bin of lags, as a share of the lag."""
 _LEAST_PAIRS = 30
@@ -142,8 +140,7 @@ def error_correlation(
     free = _freedom_share(m)
     products, pairs = free[..., None] * products, free[..., None] * pairs
     held = None if gates is None else gates.significant
-    widths = bins.bincount()
-    common, time, significant = _pooled(products.sum(1), pairs.sum(1), widths, held)
+    common, time, significant = _pooled(products.sum(1), pairs.sum(1), bins.bincount(), held)
     if gates is None:
         gates = CorrelationGates(significant, torch.zeros_like(values[..., 0], dtype=torch.bool))
         if not bool(significant.any()):
@@ -151,11 +148,8 @@ def error_correlation(
         nothing = None
     else:
         nothing = gates.nothing
-    numbers = 2 * free * m.by_frame(m.visible.sum(1)).sum(1)
-    squares = (common.square() * widths).sum(1, keepdim=True)
-    lasting = 1 + 2 * (common * widths).sum(1, keepdim=True).square() / squares.clamp_min(1e-12)
-    counts = (numbers / time.clamp_max(m.frames), numbers / lasting.clamp_max(m.frames))
-    amplitudes, nothing = _amplitudes(products, pairs, common, *counts, contrast, nothing)
+    independent = 2 * free * m.by_frame(m.visible.sum(1)).sum(1) / time.clamp_max(m.frames)
+    amplitudes, nothing = _amplitudes(products, pairs, common, independent, contrast, nothing)
     values[..., 1:] = (amplitudes[..., None] * common[:, None]).clamp(0.0, 1.0)[..., bins]
     return ErrorCorrelation(values, CorrelationGates(significant, nothing))
 
@@ -215,8 +209,7 @@ def _freedom_share(m: Measurements) -> Tensor:
 
 def _pooled(products: Tensor, pairs: Tensor, widths: Tensor, held: Tensor | None) -> tuple[Tensor, Tensor, Tensor]:
     """The correlation of all points together by bin that chance does not explain, (B, bins), and its integrated time (B, 1);
-    also in which bins there is such a correlation, (B, bins). At lags so large that chance would explain a correlation as at
-    smaller lags, one that is found and much alike is taken as real.
+    also in which bins there is such a correlation, (B, bins).
 
     The sampling variance of a bin is one over its pairs where errors are independent. Where they last, the products at
     neighbouring lags are alike too (Bartlett's formula), by what was found at smaller lags.
@@ -236,10 +229,7 @@ def _pooled(products: Tensor, pairs: Tensor, widths: Tensor, held: Tensor | None
         one = slice(number, number + 1)
         variance = torch.minimum(time.square(), width * squares) / pairs[:, one].clamp_min(0.1)
         found = products[:, one] / pairs[:, one].clamp_min(0.1)
-        chance = _SIGNIFICANT * variance.sqrt()
-        above = found > chance if held is None else held[:, one]
-        if number and held is None:
-            above = above | ((values[-1] < chance) & (values[-1] > 0) & (found > _STILL_SHARE * values[-1]))
+        above = found > _SIGNIFICANT * variance.sqrt() if held is None else held[:, one]
         enough = pairs[:, one] >= _LEAST_PAIRS if number else torch.ones_like(above)
         found = found.where(above, 0.0).clamp(0.0, 1.0)
         values.append(found if not number else found.where(enough, values[-1]))
@@ -249,13 +239,7 @@ def _pooled(products: Tensor, pairs: Tensor, widths: Tensor, held: Tensor | None
 
 
 def _amplitudes(
-    products: Tensor,
-    pairs: Tensor,
-    common: Tensor,
-    independent: Tensor,
-    independent_lasting: Tensor,
-    contrast: float,
-    nothing: Tensor | None,
+    products: Tensor, pairs: Tensor, common: Tensor, independent: Tensor, contrast: float, nothing: Tensor | None
 ) -> tuple[Tensor, Tensor]:
     """How much of the common correlation (B, bins) each point has, (B, P), drawn towards that of all points; and who has none.
 
@@ -268,7 +252,6 @@ def _amplitudes(
         pairs: their numbers, as far as they are independent, (B, P, bins).
         common: the correlation of all points together.
         independent: (B, P), number of independent errors that each point has had.
-        independent_lasting: (B, P), the same of what lasts of them.
         contrast: variance of the logarithms between points that is taken for granted.
         nothing: (B, P), the points that have none; None to decide.
     """
@@ -279,8 +262,6 @@ def _amplitudes(
     if nothing is None:
         nothing = (own < least) & (least < (-_SIGNIFICANT_OF_POINT * scatter.sqrt()).exp())
     own = torch.maximum(own, least).clamp_max(_LARGEST_AMPLITUDE)
-    half = independent_lasting.clamp_min(1.0) / 2  # degrees of freedom of a variance, whose logarithm is too small in the mean
-    sampling = by_chance / own.square() + torch.polygamma(1, half)
-    logarithms = own.log() - (torch.digamma(half) - half.log())
-    drawn = shrunk_logarithms(logarithms, sampling, independent > 0, contrast, _FARTHEST).exp()
+    sampling = by_chance / own.square() + scatter
+    drawn = shrunk_logarithms(own.log(), sampling, independent > 0, contrast, _FARTHEST).exp()
     return drawn.where(~nothing, _MEAN_BY_CHANCE * by_chance.sqrt()), nothing

@@ -51,9 +51,9 @@ _ROUGHLY, _NEARLY = 1e-3, 1e-6
 which keypoints the noise is estimated."""
 _SETTLED = 0.1
 """Relative change of the numbers of keypoints that count as one, below which a stage need not be repeated with new ones."""
-_LASTING_FRAMES, _CLEARLY_SHORTER = 3.0, 0.5
-"""As many keypoints of a stick's end as count as one, from which on its errors seem to last; and the ratio of two such numbers
-that is clearly less than 1."""
+_LASTING_FRAMES, _CLEARLY_SHORTER, _ROUNDS_BY_ENDS = 3.0, 0.5, 2
+"""As many keypoints of a stick's end as count as one, from which on its errors seem to last; the ratio of two such numbers that
+is clearly less than 1; and for how many rounds the ends are trusted alone. After the first, their noise is known."""
 
 
 @dataclass(frozen=True)
@@ -503,18 +503,19 @@ def _by_ends_where_right(name: str, stage: Stage, begun: Adjustment, ended: Adju
         least: as of :func:`run_stage`.
     """
     m = begun.measurements
-    lasting = _of_ends(ended.last.correlation_frames, m).amax(1)
+    before = _of_ends(ended.last.correlation_frames, m).amax(1)
 
     def shorter(times: Tensor) -> Tensor:
-        return (lasting > _LASTING_FRAMES) & (_of_ends(times, m).amax(1) < _CLEARLY_SHORTER * lasting)
+        return (before > _LASTING_FRAMES) & (_of_ends(times, m).amax(1) < _CLEARLY_SHORTER * before)
 
     times = begun.state.points.new_full((m.sessions, m.points_per_frame), float(m.frames))
     times[:, m.sticks.flatten()] = 1.0
-    other = begun.ended(run_stage(name, stage, m, begun.state, run, least, times))
+    other = begun
+    for _ in range(_ROUNDS_BY_ENDS):
+        other = other.ended(run_stage(name, stage, m, other.state, run, least, times))
     found = correlation_for_weights(other.kept, other.last.minimum, other.last.sigma_px)
     if not bool(shorter(found.times).any()):
         return ended
-    other = other.ended(run_stage(name, stage, m, other.state, run, least, times))  # with the noise that the ends have there
     other = _repeated(name, stage, other, run, least, times.where(times == 1.0, torch.nan))
     other = other.ended(run_stage(name, stage, m, other.state, run, least))
     return ended.replaced(shorter(other.last.correlation_frames), other)

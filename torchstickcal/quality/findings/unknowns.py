@@ -151,8 +151,8 @@ def _all_focals(evidence: Evidence) -> Iterator[Finding]:
         yield Finding(
             "focal_contradicted",
             Severity.SERIOUS if abs(wanted) > _CONTRADICTED_SIGMAS * std else Severity.CAUTION,
-            f"All focal lengths together: the keypoints suggest {100 * change:+.1f} ± {100 * std:.1f} %, compared with the given "
-            "ones, which were used.",
+            f"All focal lengths together: the keypoints suggest {100 * change:+.1f} ± {100 * std:.1f} %, but the "
+            "given ones were used.",
             "Check them, or estimate their common factor (refine 'focal_shared').",
             cameras=names,
             figure=wanted / std,
