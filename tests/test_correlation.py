@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import pytest
 import torch
@@ -17,8 +18,11 @@ from torchstickcal.model.correlation import ErrorCorrelation, error_correlation
 from torchstickcal.model.measurements import Measurements
 from torchstickcal.model.objective import Objective
 from torchstickcal.model.state import State
-from torchstickcal.pipeline.adjust import Adjustment, adjust_cameras, begin
+from torchstickcal.pipeline import stages
+from torchstickcal.pipeline.adjust import adjust_cameras, begin
+from torchstickcal.pipeline.adjustment import Adjustment
 from torchstickcal.pipeline.run import Run
+from torchstickcal.pipeline.stage import StageResult, run_stage
 from torchstickcal.simulate import Lens, Noise, SessionSpec, golf_session
 from torchstickcal.simulate.regimes import DetectorNoise
 from torchstickcal.solvers import correlated
@@ -169,6 +173,20 @@ def test_ends_are_trusted_in_the_session_of_a_batch_that_needs_it():
     for number, begun in enumerate(both):
         alone = adjust_cameras(begun, run)
         torch.testing.assert_close(together.state.rotations[number], alone.state.rotations[0], rtol=0.0, atol=1e-4)
+
+
+def test_what_keypoints_count_is_not_estimated_where_it_is_given(monkeypatch: pytest.MonkeyPatch):
+    """A stage runs once then, however long the errors of the sticks' ends are said to last."""
+    names: list[str] = []
+
+    def noted(name: str, *arguments: Any, **keywords: Any) -> StageResult:
+        names.append(name)
+        return run_stage(name, *arguments, **keywords)
+
+    monkeypatch.setattr(stages, "run_stage", noted)
+    given = {"extends": "default", "stages": {"refined": {"reprojection": {"correlation_frames": 10.0}}}}
+    calibrate(seen_elsewhere("golf", 3, 0)[0], given)
+    assert names.count("refined") == 1
 
 
 def truth_centres(truth: Truth) -> torch.Tensor:

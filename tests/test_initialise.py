@@ -17,7 +17,8 @@ from torchstickcal.geometry.triangulation import triangulate, triangulate_robust
 from torchstickcal.model.measurements import Measurements
 from torchstickcal.model.state import State
 from torchstickcal.pipeline import adjust
-from torchstickcal.pipeline.adjust import Adjustment, adjust_cameras, begin
+from torchstickcal.pipeline.adjust import adjust_cameras, begin
+from torchstickcal.pipeline.adjustment import Adjustment
 from torchstickcal.pipeline.initialise import initialise
 from torchstickcal.pipeline.initialise.graph import Edge, propagate, spanning_tree
 from torchstickcal.pipeline.initialise.pairs import Pair, RelativePose, relate

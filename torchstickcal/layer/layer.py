@@ -18,7 +18,8 @@ from torchstickcal.layer.result import LayerResult
 from torchstickcal.layer.transforms import calibrated_in_any_transform, is_transformed, outside_graphs
 from torchstickcal.model.state import State
 from torchstickcal.model.unknowns import RigUnknowns
-from torchstickcal.pipeline.adjust import Adjustment, adjust_cameras, adjust_points, begin
+from torchstickcal.pipeline.adjust import adjust_cameras, adjust_points, begin
+from torchstickcal.pipeline.adjustment import Adjustment
 from torchstickcal.pipeline.attach import attach_gradients
 from torchstickcal.pipeline.check import CameraCheck
 from torchstickcal.pipeline.conclude import evidence_of

@@ -12,7 +12,7 @@ from torch.utils import _pytree as pytree
 
 from torchstickcal.model.measurements import Measurements
 from torchstickcal.model.state import State
-from torchstickcal.pipeline.adjust import WarmStart
+from torchstickcal.pipeline.adjustment import WarmStart
 from torchstickcal.pipeline.relabel import Labels
 from torchstickcal.quality.finding import Finding, Severity
 from torchstickcal.quality.verdict import Acceptance, LengthErrors, Quality, Verdict

@@ -7,8 +7,8 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Hashable, Iterable, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable, Sequence
+from dataclasses import replace
 
 import torch
 from torch import Tensor
@@ -19,27 +19,26 @@ from torchstickcal.model.ranks import nanquantile
 from torchstickcal.model.state import State
 from torchstickcal.model.unknowns import RigUnknowns, clock_refinements, with_refinements
 from torchstickcal.observations import Observations
+from torchstickcal.pipeline.adjustment import Adjustment, WarmStart
 from torchstickcal.pipeline.focal_search import search_focal
 from torchstickcal.pipeline.initialise import initialise, triangulated
-from torchstickcal.pipeline.noise import check_noise, correlation_for_weights
+from torchstickcal.pipeline.noise import check_noise
 from torchstickcal.pipeline.relabel import Labels, mended
 from torchstickcal.pipeline.run import Run
 from torchstickcal.pipeline.scale import check_scale, rulers
 from torchstickcal.pipeline.settle import polished, settled
-from torchstickcal.pipeline.stage import StageResult, agreeing_cameras, run_stage
+from torchstickcal.pipeline.stage import StageResult, run_stage
+from torchstickcal.pipeline.stages import through
 from torchstickcal.pipeline.synchronise import (
     CLOCK_STAGE,
     CommonFrames,
-    Exposures,
     Support,
     on_common_frames,
     synchronise_keypoints,
 )
-from torchstickcal.solvers import StageRecord
 
 _INITIALISE, _RELABEL = "initialise", "relabel"
 _MAX_RELABELLINGS = 3
-_MOST_ROUNDS = 6
 _ALIKE, _CLEARLY_LESS = 4.0, 0.9
 """Ratio of the lower quartiles of the squared residuals of two scenes, below which their images are alike; and the ratio that
 says that one of them is wrong."""
@@ -49,208 +48,6 @@ _MOST_SORTED = 100_003
 _ROUGHLY, _NEARLY = 1e-3, 1e-6
 """Relative decrease of the cost from which on Newton's method can take over; and the same where it is first decided there from
 which keypoints the noise is estimated."""
-_SETTLED = 0.1
-"""Relative change of the numbers of keypoints that count as one, below which a stage need not be repeated with new ones."""
-_LASTING_FRAMES, _CLEARLY_SHORTER, _ROUNDS_BY_ENDS = 3.0, 0.5, 2
-"""As many keypoints of a stick's end as count as one, from which on its errors seem to last; the ratio of two such numbers that
-is clearly less than 1; and for how many rounds the ends are trusted alone. After the first, their noise is known."""
-
-
-@dataclass(frozen=True)
-class Adjustment:
-    """B sessions on their way: what was measured, and what has been estimated so far."""
-
-    observations: tuple[Observations, ...]
-    frames: tuple[CommonFrames, ...]
-    """with the keypoints as given"""
-    refined: tuple[str, ...]
-    """what is estimated of the cameras beside their poses, of :data:`torchstickcal.model.unknowns.REFINEMENTS`"""
-    seen: Measurements
-    """the keypoints as detected, on the common frames, where they belong by the labels"""
-    measurements: Measurements
-    """the same keypoints, moved in the image to where they would be at the times of the common frames"""
-    state: State
-    labels: Labels
-    """which given keypoint each point uses, on the common frames"""
-    results: tuple[StageResult, ...] = ()
-    """of the last stage that estimated cameras, and of those after it"""
-    records: tuple[tuple[StageRecord, ...], ...] = ((),)
-    """of every stage, for each session"""
-    window: slice = field(default_factory=lambda: slice(None))
-    """which of the common frames this is about"""
-
-    @staticmethod
-    def stack(sessions: Sequence[Adjustment]) -> Adjustment:
-        """Sessions of one kind that have just begun or ended a stage, as one batch, without results."""
-        return Adjustment(
-            tuple(session.observations[0] for session in sessions),
-            tuple(session.frames[0] for session in sessions),
-            sessions[0].refined,
-            Measurements.stack([session.seen for session in sessions]),
-            Measurements.stack([session.measurements for session in sessions]),
-            State.stack([session.state for session in sessions]),
-            Labels.stack([session.labels for session in sessions]),
-            records=((),) * len(sessions),
-        )
-
-    @property
-    def kind(self) -> Hashable:
-        """What sessions have in common that can be adjusted as one batch by one configuration."""
-        m = self.measurements
-        lens = m.cameras.distortion
-        return (
-            *(m.pixels.shape, m.pixels.dtype, m.pixels.device, m.frames, m.point_names),
-            *(m.cameras.matrix.dtype, m.cameras.fisheye, None if lens is None else lens.shape),
-            *(tuple(m.sticks.flatten().tolist()), tuple(m.stick_sigma_m.tolist())),
-            *(self.refined, m.motion is None, self.asynchronous),
-        )
-
-    @property
-    def exposures(self) -> Exposures:
-        """When the keypoints were exposed."""
-        sessions = enumerate(self.frames)
-        labelled = [replace(f, observations=self.labels[n : n + 1].applied(f.observations)) for n, f in sessions]
-        return Exposures.stack([Exposures.of(frames, self.window) for frames in labelled])
-
-    @property
-    def last_camera_stage(self) -> StageResult:
-        """Where the last stage that estimated cameras ended."""
-        return self.results[0]
-
-    @property
-    def last(self) -> StageResult:
-        """Where the last stage ended."""
-        return self.results[-1]
-
-    @property
-    def support(self) -> Support:
-        """How well the points are known where the last stage ended."""
-        return Support.of(self.kept, self.state, self.last.sigma_px)
-
-    @property
-    def kept(self) -> Measurements:
-        """The measurements that took part to the end."""
-        return self.measurements.keeping(self.last.inliers)
-
-    @property
-    def agreeing_cameras(self) -> Tensor:
-        """(B, C), the cameras whose keypoints agree with those of the other cameras."""
-        return agreeing_cameras(self.measurements, self.kept)
-
-    @property
-    def asynchronous(self) -> bool:
-        """Whether keypoints of one common frame were, or may have been, exposed at different times."""
-        return any(frames.apart for frames in self.frames) or self.seen.unknowns.clocked
-
-    @property
-    def converged(self) -> bool:
-        """Whether every stage converged, in all sessions."""
-        return all(record.stop.converged for records in self.records for record in records)
-
-    def status(self, session: int) -> str:
-        """``converged``, or which stages of a session did not and why."""
-        failed = [f"{record.name}: {record.stop}" for record in self.records[session] if not record.stop.converged]
-        return "; ".join(failed) or "converged"
-
-    @property
-    def remaining_offsets_frames(self) -> Tensor:
-        """(C,), time offsets of one session's cameras beyond those by which their frames were chosen, as found, in frames."""
-        found = self.seen.unknowns.by_name(self.state.unknowns).get("time_offset")
-        return torch.zeros_like(self.frames[0].offsets_frames) if found is None else found[0, :, 0]
-
-    @property
-    def deviations(self) -> dict[str, Tensor]:
-        """(C, n), what was found beyond the given values in one session, by the name of the unknown, in units of deviations."""
-        found = {name: own[0] for name, own in self.seen.unknowns.by_name(self.state.unknowns).items()}
-        if "time_offset" in found:
-            found["time_offset"] = found["time_offset"] + self.frames[0].offsets_frames[:, None]
-        return found
-
-    def __getitem__(self, session: int) -> Adjustment:
-        """One of the sessions that has just begun or ended a stage, without results."""
-        one = slice(session, session + 1)
-        return replace(
-            self,
-            observations=self.observations[one],
-            frames=self.frames[one],
-            seen=self.seen[one],
-            measurements=self.measurements[one],
-            state=self.state[one],
-            labels=self.labels[one],
-            results=(),
-            records=((),),
-        )
-
-    def alone(self, session: int) -> Adjustment:
-        """One of the sessions with its results and records."""
-        sessions = len(self.records)
-        return replace(
-            self[session],
-            results=tuple(result.of(session) for result in self.results),
-            records=(tuple(record.of_one(sessions) for record in self.records[session]),),
-        )
-
-    def after(self, earlier: Adjustment) -> Adjustment:
-        """With the results and records that the same session had before."""
-        records = tuple((*before, *own) for before, own in zip(earlier.records, self.records, strict=True))
-        return replace(self, results=(*earlier.results, *self.results), records=records)
-
-    def replaced(self, where: Tensor, other: Adjustment) -> Adjustment:
-        """The adjustment with the results of some sessions (B,), True where, taken from another of the same sessions."""
-        taken = where.tolist()
-        return replace(
-            self,
-            state=self.state.replaced(where, other.state),
-            results=tuple(mine.replaced(where, theirs) for mine, theirs in zip(self.results, other.results, strict=True)),
-            records=tuple(b if t else a for a, b, t in zip(self.records, other.records, taken, strict=True)),
-        )
-
-    def ended(self, result: StageResult) -> Adjustment:
-        """After one more stage."""
-        records = tuple((*before, record) for before, record in zip(self.records, result.records, strict=True))
-        earlier = self.results if result.stage.cameras == "held" and self.results else ()
-        return replace(self, state=result.state, results=(*earlier, result), records=records)
-
-    def within(self, most_frames: int) -> Adjustment:
-        """The middle of sessions that are longer."""
-        total = self.measurements.frames
-        if total <= most_frames:
-            return self
-        start = (total - most_frames) // 2
-        window = slice(start, start + most_frames)
-        columns = self.measurements.columns_of(window)
-
-        def cut(state: State) -> State:
-            return replace(state, points=state.points[..., columns])
-
-        return replace(
-            self,
-            seen=self.seen.within(window),
-            measurements=self.measurements.within(window),
-            state=cut(self.state),
-            results=tuple(
-                r._replace(state=cut(r.state), minimum=cut(r.minimum), inliers=r.inliers[..., columns]) for r in self.results
-            ),
-            window=window,
-        )
-
-
-@dataclass(frozen=True)
-class WarmStart:
-    """An earlier estimate of one session to start from."""
-
-    rotations: Tensor
-    """(C, 3, 3), world to camera"""
-    translations: Tensor
-    """(C, 3), metres"""
-    points: Tensor | None
-    """(F, P, 3), metres, NaN where not known; None if none is known"""
-    unknowns: Tensor
-    """(K,), of the cameras"""
-    inliers: Tensor | None
-    """(C, F, P), None for all keypoints"""
-    sigma_px: Tensor
-    """(P,)"""
 
 
 def begin(
@@ -455,76 +252,6 @@ def _finished(
     ended = run_stage(name, stage, adjustment.measurements, begin_at, run)
     result, _ = finish(name, adjustment.measurements, ended, run)
     return replace(adjustment, results=earlier).ended(result).replaced(found, finished)
-
-
-def through(stages: Iterable[tuple[str, Stage]], adjustment: Adjustment, run: Run, least: float = 0.0) -> Adjustment:
-    """After some stages. One in which keypoints count as fewer is repeated, until what they count no longer changes.
-
-    Errors that last are hidden in the cameras, as long as points with such errors determine them. Cameras that joints have
-    deceived contradict the sticks, whose ends then seem to err in the same way for long. So where they do, the stage is also
-    begun from the ends alone, and where their errors last clearly less from there, that is right.
-    """
-    for name, stage in stages:
-        begun, adjustment = adjustment, _repeated(name, stage, adjustment, run, least)
-        lasting = _of_ends(adjustment.last.correlation_frames, adjustment.measurements)
-        if bool((lasting > _LASTING_FRAMES).any()):
-            adjustment = _by_ends_where_right(name, stage, begun, adjustment, run, least)
-    return adjustment
-
-
-def _repeated(
-    name: str, stage: Stage, adjustment: Adjustment, run: Run, least: float, times: Tensor | None = None
-) -> Adjustment:
-    """After one stage, which is repeated until what keypoints count no longer changes; arguments as of :func:`run_stage`."""
-    adjustment = adjustment.ended(run_stage(name, stage, adjustment.measurements, adjustment.state, run, least, times))
-    before, found = torch.ones_like(adjustment.last.correlation_frames), adjustment.last.correlation_frames
-    for _ in range(_MOST_ROUNDS - 1):
-        unchanged = ((found / before).log().abs() < _SETTLED).flatten(1).all(1)
-        if bool(unchanged.all()):
-            break
-        again = adjustment.ended(run_stage(name, stage, adjustment.measurements, adjustment.state, run, least, times))
-        adjustment = again.replaced(unchanged, adjustment)
-        before, found = found, adjustment.last.correlation_frames
-    return adjustment
-
-
-def _by_ends_where_right(name: str, stage: Stage, begun: Adjustment, ended: Adjustment, run: Run, least: float) -> Adjustment:
-    """After one stage, with the sessions in which the ends of the sticks are to be trusted begun from these alone.
-
-    It is begun as if the errors of the ends were independent, and those of all other points always the same. Then it is
-    repeated with what the others are found to count, and once with what the ends are found to count, too.
-
-    Args:
-        name: of the stage.
-        stage: its settings.
-        begun: where it began.
-        ended: where it has ended, with the errors of some ends that last.
-        run: what all steps share.
-        least: as of :func:`run_stage`.
-    """
-    m = begun.measurements
-    before = _of_ends(ended.last.correlation_frames, m).amax(1)
-
-    def shorter(times: Tensor) -> Tensor:
-        return (before > _LASTING_FRAMES) & (_of_ends(times, m).amax(1) < _CLEARLY_SHORTER * before)
-
-    times = begun.state.points.new_full((m.sessions, m.points_per_frame), float(m.frames))
-    times[:, m.sticks.flatten()] = 1.0
-    other = begun
-    for _ in range(_ROUNDS_BY_ENDS):
-        other = other.ended(run_stage(name, stage, m, other.state, run, least, times))
-    found = correlation_for_weights(other.kept, other.last.minimum, other.last.sigma_px)
-    if not bool(shorter(found.times).any()):
-        return ended
-    other = _repeated(name, stage, other, run, least, times.where(times == 1.0, torch.nan))
-    other = other.ended(run_stage(name, stage, m, other.state, run, least))
-    return ended.replaced(shorter(other.last.correlation_frames), other)
-
-
-def _of_ends(times: Tensor, m: Measurements) -> Tensor:
-    """Of numbers (B, P) those of the ends of sticks, (B, 2 S); (B, 0) if there are no other points."""
-    ends = m.sticks.flatten()
-    return times[:, ends] if len(set(ends.tolist())) < times.shape[1] else times[:, :0]
 
 
 def _relabelling(stages: Sequence[tuple[str, Stage]], begun: Adjustment, run: Run) -> Adjustment:

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from torchstickcal.model.measurements import Measurements
 from torchstickcal.model.state import State
-from torchstickcal.pipeline.adjust import Adjustment
+from torchstickcal.pipeline.adjustment import Adjustment
 from torchstickcal.pipeline.noise import HeldNoise, NoiseLevels
 from torchstickcal.pipeline.run import Run
 from torchstickcal.pipeline.scale import rulers, scale_factors

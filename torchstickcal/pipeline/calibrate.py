@@ -13,7 +13,8 @@ from torchstickcal.errors import RigError
 from torchstickcal.losses import LOSSES
 from torchstickcal.model.unknowns import REFINEMENTS
 from torchstickcal.observations import Observations
-from torchstickcal.pipeline.adjust import Adjustment, adjust_cameras, adjust_points
+from torchstickcal.pipeline.adjust import adjust_cameras, adjust_points
+from torchstickcal.pipeline.adjustment import Adjustment
 from torchstickcal.pipeline.check import CameraCheck
 from torchstickcal.pipeline.conclude import conclude
 from torchstickcal.pipeline.run import Run

@@ -23,7 +23,7 @@ from torchstickcal.model.measurements import Measurements
 from torchstickcal.model.objective import Objective
 from torchstickcal.model.state import State
 from torchstickcal.model.unknowns import RigUnknowns, all_unknowns, clock_refinements, with_refinements
-from torchstickcal.pipeline.adjust import Adjustment
+from torchstickcal.pipeline.adjustment import Adjustment
 from torchstickcal.pipeline.folds import Fold, folds_of_frames, folds_of_points
 from torchstickcal.solvers import Termination, ignore_record
 from torchstickcal.solvers.elimination.normal_equations import NormalEquations

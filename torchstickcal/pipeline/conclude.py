@@ -12,7 +12,7 @@ from torchstickcal.config import Config
 from torchstickcal.geometry.singular import definite
 from torchstickcal.model.correlation import error_correlation
 from torchstickcal.model.unknowns import CameraUnknown, RigEstimate, all_unknowns
-from torchstickcal.pipeline.adjust import Adjustment
+from torchstickcal.pipeline.adjustment import Adjustment
 from torchstickcal.pipeline.check import CameraCheck
 from torchstickcal.pipeline.height import HEIGHT_STD
 from torchstickcal.pipeline.run import Run

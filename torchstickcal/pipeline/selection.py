@@ -15,14 +15,8 @@ from torchstickcal.lazy import cached_property
 from torchstickcal.model.measurements import Measurements
 from torchstickcal.model.unknowns import REFINEMENTS, clock_refinements, with_refinements
 from torchstickcal.observations import Observations
-from torchstickcal.pipeline.adjust import (
-    Adjustment,
-    adjust_again,
-    adjust_cameras,
-    begin,
-    begin_at_nearest_frames,
-    measured,
-)
+from torchstickcal.pipeline.adjust import adjust_again, adjust_cameras, begin, begin_at_nearest_frames, measured
+from torchstickcal.pipeline.adjustment import Adjustment
 from torchstickcal.pipeline.check import CameraCheck
 from torchstickcal.pipeline.run import Run
 from torchstickcal.pipeline.synchronise import ClockEstimate, clocks_unlike_given, on_common_frames, search_offsets

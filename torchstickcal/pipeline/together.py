@@ -12,7 +12,7 @@ from contextlib import suppress
 
 from torchstickcal.config import Config
 from torchstickcal.observations import Observations
-from torchstickcal.pipeline.adjust import Adjustment
+from torchstickcal.pipeline.adjustment import Adjustment
 from torchstickcal.pipeline.calibrate import Due, calibration_steps
 from torchstickcal.pipeline.run import Run
 from torchstickcal.result import Calibration

@@ -15,12 +15,14 @@ from torchstickcal.losses import FrameLoss, TrackLoss
 from torchstickcal.model.state import State
 from torchstickcal.model.unknowns import RigUnknowns
 from torchstickcal.observations import Observations
-from torchstickcal.pipeline.adjust import Adjustment, measured, relabelled, through
+from torchstickcal.pipeline.adjust import measured, relabelled
+from torchstickcal.pipeline.adjustment import Adjustment
 from torchstickcal.pipeline.conclude import keypoint_index, residuals_of
 from torchstickcal.pipeline.initialise import triangulated
 from torchstickcal.pipeline.relabel import Labels
 from torchstickcal.pipeline.run import Run
 from torchstickcal.pipeline.stage import run_stage
+from torchstickcal.pipeline.stages import through
 from torchstickcal.pipeline.start import cameras_of
 from torchstickcal.pipeline.synchronise import clocks_unlike_given, on_common_frames
 from torchstickcal.quality.evidence import Evidence

@@ -21,7 +21,7 @@ from torchstickcal.losses import ReprojectionLoss
 from torchstickcal.model.measurements import Measurements
 from torchstickcal.model.objective import Objective
 from torchstickcal.model.state import State
-from torchstickcal.pipeline.adjust import Adjustment
+from torchstickcal.pipeline.adjustment import Adjustment
 from torchstickcal.pipeline.folds import folds_of_frames
 from torchstickcal.quality.verdict import Acceptance, LengthErrors
 from torchstickcal.shapes import extended

@@ -18,7 +18,7 @@ from torchstickcal.model.ranks import nanquantile
 from torchstickcal.model.state import State
 from torchstickcal.model.unknowns import all_unknowns
 from torchstickcal.observations import Observations
-from torchstickcal.pipeline.adjust import Adjustment
+from torchstickcal.pipeline.adjustment import Adjustment
 from torchstickcal.pipeline.check import CameraCheck
 from torchstickcal.pipeline.synchronise import ClockEstimate
 from torchstickcal.quality.acceptance import accepted

@@ -14,7 +14,8 @@ from torchstickcal.config import Config
 from torchstickcal.errors import CalibrationError, ObservationError
 from torchstickcal.geometry.cameras import Intrinsics
 from torchstickcal.observations import Observations
-from torchstickcal.pipeline.adjust import Adjustment, adjust_cameras, begin
+from torchstickcal.pipeline.adjust import adjust_cameras, begin
+from torchstickcal.pipeline.adjustment import Adjustment
 from torchstickcal.pipeline.run import Run
 from torchstickcal.quality.evidence import Evidence
 from torchstickcal.quality.resection import AGREEING_SIGMAS, LEAST_REACH, Resection, resected
