@@ -97,6 +97,24 @@ def test_help_does_not_change_a_bit(
 
 
 @pytest.mark.usefixtures("two_workers")
+def test_gradients_of_what_several_threads_have_computed(
+    disturbed: tuple[Measurements, State], monkeypatch: pytest.MonkeyPatch
+):
+    m, state = disturbed
+    leaves = state.leaves()
+
+    def gradients() -> tuple[torch.Tensor, ...]:
+        squared = m.squared_residuals(leaves)
+        return torch.autograd.grad(squared[squared.isfinite()].sum(), [leaves.points, leaves.translations])
+
+    expected = gradients()
+    monkeypatch.setattr("torchstickcal.model.measurements._CHUNK_KEYPOINTS", {"cpu": 50})
+    for _ in range(20):
+        for found, right in zip(on_worker(CPU, gradients), expected, strict=True):
+            torch.testing.assert_close(found, right, rtol=1e-9, atol=1e-9)
+
+
+@pytest.mark.usefixtures("two_workers")
 def test_derivatives_of_own_losses_in_several_threads(disturbed: tuple[Measurements, State]):
     """Dual numbers exist in one thread at a time."""
     m, state = disturbed

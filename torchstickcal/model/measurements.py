@@ -171,16 +171,16 @@ class Measurements:
 
         Infinite where a keypoint is not seen or its point lies behind the camera.
         """
-        squared, cameras = torch.empty_like(self.confidence), self.cameras_at(state)
+        cameras = self.cameras_at(state)
 
-        def fill(columns: slice) -> None:
+        def squared(columns: slice) -> Tensor:
             residuals, depth = self._residuals(state, cameras, columns)
             confidence = self.confidence[..., columns]
             distance = residuals.square().sum(-2) * confidence
-            squared[..., columns] = distance.where((confidence > 0) & (depth > 0), torch.inf)
+            return distance.where((confidence > 0) & (depth > 0), torch.inf)
 
-        map_with_idle_workers(fill, self.chunks())
-        return squared
+        # Threads may not write into one tensor: the graph of its gradients would not survive that.
+        return torch.cat(map_with_idle_workers(squared, self.chunks()), dim=-1)
 
     def residuals(self, state: State) -> Iterator[tuple[slice, Tensor, Tensor]]:
         """Projections minus keypoints (B, C, 2, n), pixels, and the points' depths (B, C, n), metres, by chunks of columns."""
