@@ -90,10 +90,10 @@ def check(calibration: Calibration | OldRig, observations: Observations) -> Qual
         >>> print(check(calibrate(old.observations), new.observations).verdict)
         good
     """
-    rig = calibration
-    if isinstance(calibration, Calibration):
-        rig = OldRig(calibration.rotations, calibration.translations, calibration.covariance)
-    assert isinstance(rig, OldRig)
+    cpu, covariance = torch.device("cpu"), calibration.covariance  # where so little is quickest
+    rig = OldRig(
+        calibration.rotations.to(cpu), calibration.translations.to(cpu), None if covariance is None else covariance.to(cpu)
+    )
     if len(rig.rotations) != observations.num_cameras:
         raise ObservationError(
             "the number of cameras differs",
@@ -101,7 +101,7 @@ def check(calibration: Calibration | OldRig, observations: Observations) -> Qual
             got=f"{observations.num_cameras} cameras",
             expected=f"{len(rig.rotations)} as in the calibration",
         )
-    return on_worker(observations.keypoints.device, _checked, rig, observations)
+    return on_worker(cpu, _checked, rig, observations.to(cpu))
 
 
 class _Rig:
