@@ -101,7 +101,7 @@ def check(calibration: Calibration | OldRig, observations: Observations) -> Qual
             got=f"{observations.num_cameras} cameras",
             expected=f"{len(rig.rotations)} as in the calibration",
         )
-    return on_worker(cpu, _checked, rig, observations.to(cpu))
+    return on_worker(torch.device("cpu"), _checked, rig, observations.to("cpu"))
 
 
 class _Rig:
