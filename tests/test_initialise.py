@@ -17,6 +17,7 @@ from torchstickcal.geometry.triangulation import triangulate, triangulate_robust
 from torchstickcal.model.measurements import Measurements
 from torchstickcal.model.state import State
 from torchstickcal.pipeline import adjust
+from torchstickcal.pipeline import initialise as initialising
 from torchstickcal.pipeline.adjust import adjust_cameras, begin
 from torchstickcal.pipeline.adjustment import Adjustment
 from torchstickcal.pipeline.initialise import initialise
@@ -260,3 +261,25 @@ def test_keypoints_that_never_move_do_not_start_the_rig(place: tuple[float, floa
     truth = session.truth
     found_errors = metrics.pose_errors(found.rotations, found.translations, truth.rotations, truth.translations)
     assert found_errors.mean_translation_m < 0.03
+
+
+@pytest.mark.parametrize("intrinsics", ["given", "unknown"])
+def test_the_ends_of_the_sticks_can_be_the_start(intrinsics: str, monkeypatch: pytest.MonkeyPatch):
+    """Whatever else is unknown where they are tried: here they always are, and are always taken."""
+    monkeypatch.setattr(initialising, "_RIGID", 0.0)
+    monkeypatch.setattr(initialising, "_CLEARLY_LESS", 1e9)
+    monkeypatch.setattr(initialising, "_AS_GOOD", 1e9)
+    given, truth = golf_session(cameras=3, frames=60, noise=Noise(0.5))
+    observations = Observations(
+        given.keypoints,
+        None if intrinsics == "unknown" else given.intrinsics,
+        given.sticks,
+        image_size=(1920, 1080),
+        distortion=None if intrinsics == "unknown" else given.distortion,
+    )
+    found = calibrate(observations)
+    assert found.converged
+    assert (
+        float(metrics.pose_errors(found.rotations, found.translations, truth.rotations, truth.translations).mean_translation_m)
+        < 0.2
+    )

@@ -88,7 +88,7 @@ def _change_of_lengths(measurements: Measurements, state: State) -> float:
 
 def _misfit(measurements: Measurements, state: State) -> float:
     """The lower quartile of the squared residuals, square pixels: few outliers are among them."""
-    squared = measurements.squared_residuals(state).double()
+    squared = measurements.squared_residuals(replace(state, unknowns=measurements.unknowns.given)).double()
     return float(nanquantile(squared.where(measurements.visible, torch.nan).flatten(1), 0.25))
 
 
