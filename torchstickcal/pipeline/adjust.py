@@ -15,13 +15,12 @@ from torch import Tensor
 
 from torchstickcal.config import Config, Stage
 from torchstickcal.model.measurements import Measurements
-from torchstickcal.model.ranks import nanquantile
 from torchstickcal.model.state import State
 from torchstickcal.model.unknowns import RigUnknowns, clock_refinements, with_refinements
 from torchstickcal.observations import Observations
 from torchstickcal.pipeline.adjustment import Adjustment, WarmStart
 from torchstickcal.pipeline.focal_search import search_focal
-from torchstickcal.pipeline.initialise import initialise, triangulated
+from torchstickcal.pipeline.initialise import initialise, small_squared_residuals, triangulated
 from torchstickcal.pipeline.noise import check_noise
 from torchstickcal.pipeline.relabel import Labels, mended
 from torchstickcal.pipeline.run import Run
@@ -44,7 +43,6 @@ _ALIKE, _CLEARLY_LESS = 4.0, 0.9
 says that one of them is wrong."""
 _EXACT = 1e-5
 """Cost tolerance of the stage for this comparison."""
-_MOST_SORTED = 100_003
 _ROUGHLY, _NEARLY = 1e-3, 1e-6
 """Relative decrease of the cost from which on Newton's method can take over; and the same where it is first decided there from
 which keypoints the noise is estimated."""
@@ -275,8 +273,9 @@ def _on_the_right_side(stages: Sequence[tuple[str, Stage]], ended: Adjustment, r
     Images of a distant scene look almost alike if its depths are reversed (Necker's cube). With large errors the start may be
     on the wrong side, and an adjustment does not leave it. A scene that fits much better than its reverse is none.
     """
-    squared, reverse = _small_squared_residuals(ended), ended.state.depth_reversed(ended.measurements.active)
-    alike = _small_squared_residuals(replace(ended, state=reverse)) < _ALIKE * squared
+    m, reverse = ended.measurements, ended.state.depth_reversed(ended.measurements.active)
+    squared = small_squared_residuals(m, ended.state)
+    alike = small_squared_residuals(m, reverse) < _ALIKE * squared
     if not bool(alike.any()):
         return ended
     exact = [(name, replace(stage, cost_tolerance=min(stage.cost_tolerance, _EXACT))) for name, stage in stages]
@@ -285,19 +284,12 @@ def _on_the_right_side(stages: Sequence[tuple[str, Stage]], ended: Adjustment, r
         return through(exact, replace(ended, state=state, results=(), records=((),) * ended.seen.sessions), run)
 
     others = again(reverse)
-    closer = _small_squared_residuals(others) < squared
+    squared_elsewhere = small_squared_residuals(m, others.state)
+    closer = squared_elsewhere < squared
     if not bool((alike & closer).any()):
         return ended
-    better = alike & closer & (_small_squared_residuals(others) < _CLEARLY_LESS * _small_squared_residuals(again(ended.state)))
+    better = alike & closer & (squared_elsewhere < _CLEARLY_LESS * small_squared_residuals(m, again(ended.state).state))
     return ended.replaced(better, others) if bool(better.any()) else ended
-
-
-def _small_squared_residuals(adjustment: Adjustment) -> Tensor:
-    """The lower quartile of each session's squared residuals, (B,), square pixels: few outliers are among them."""
-    m = adjustment.measurements
-    squared = m.squared_residuals(adjustment.state).double().where(m.visible, torch.nan).flatten(1)
-    step = -(-squared.shape[1] // _MOST_SORTED)
-    return nanquantile(squared[:, ::step], 0.25)
 
 
 def relabelled(adjustment: Adjustment, run: Run) -> Adjustment:

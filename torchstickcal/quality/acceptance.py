@@ -37,7 +37,7 @@ _WRONG_SIGMAS = 6.0
 """Error of a length, in its standard deviations, from which on a keypoint of its ends is simply wrong."""
 
 
-def accepted(ended: Adjustment, noise: Tensor, ruler: Tensor, by_focal_m: float = torch.nan) -> Acceptance | None:
+def accepted(ended: Adjustment, noise: Tensor, ruler: Tensor, by_focal_m: float) -> Acceptance | None:
     """The acceptance test of one session; None where no camera was estimated or no point is known.
 
     Args:

@@ -90,10 +90,9 @@ def check(calibration: Calibration | OldRig, observations: Observations) -> Qual
         >>> print(check(calibrate(old.observations), new.observations).verdict)
         good
     """
-    cpu, covariance = torch.device("cpu"), calibration.covariance  # where so little is quickest
-    rig = OldRig(
-        calibration.rotations.to(cpu), calibration.translations.to(cpu), None if covariance is None else covariance.to(cpu)
-    )
+    cpu = torch.device("cpu")  # where so little is quickest
+    covariance = None if calibration.covariance is None else calibration.covariance.to(cpu)
+    rig = OldRig(calibration.rotations.to(cpu), calibration.translations.to(cpu), covariance)
     if len(rig.rotations) != observations.num_cameras:
         raise ObservationError(
             "the number of cameras differs",
@@ -101,7 +100,7 @@ def check(calibration: Calibration | OldRig, observations: Observations) -> Qual
             got=f"{observations.num_cameras} cameras",
             expected=f"{len(rig.rotations)} as in the calibration",
         )
-    return on_worker(torch.device("cpu"), _checked, rig, observations.to("cpu"))
+    return on_worker(cpu, _checked, rig, observations.to("cpu"))
 
 
 class _Rig:

@@ -190,7 +190,7 @@ class Evidence:
     def common_focal(self) -> tuple[float, float] | None:
         """Logarithm of the factor on all focal lengths that the keypoints suggest, and its standard deviation; None where focal
         lengths were estimated, or are those of several groups."""
-        if self.check is None or any(name.startswith("focal") for name in self.ended.refined):
+        if self.check is None or self.unknowns["focal"].refined:
             return None
         values, stds = self.check.suggestion_for_all("focal_shared")
         return (float(values), float(stds)) if len(values) == 1 else None
@@ -362,6 +362,21 @@ class Evidence:
             return torch.nan
         covariances = centre_covariances(self.centres, self.check.tangents_by("focal", 0.01))[1:]
         return float(covariances.diagonal(dim1=1, dim2=2).sum(1).mean().sqrt())
+
+
+def median_distances(places: Tensor, seen: Tensor) -> dict[tuple[int, int], float]:
+    """Of each two cameras that have some places in common, the median distance between the places in one and in the other.
+
+    Args:
+        places: (C, d, N).
+        seen: which of them a camera has, (C, N).
+    """
+    found: dict[tuple[int, int], float] = {}
+    for first in range(len(places) - 1):
+        squared = (places[first] - places[first + 1 :]).square().sum(1).where(seen[first] & seen[first + 1 :], torch.nan)
+        medians = squared.nanmedian(1).values.sqrt().tolist()
+        found |= {(first, second): distance for second, distance in enumerate(medians, first + 1) if not math.isnan(distance)}
+    return found
 
 
 def without_depth(points: Tensor, centres: Tensor, seen: Tensor) -> Tensor:

@@ -24,13 +24,14 @@ from torchstickcal.pipeline.initialise.graph import propagate, spanning_tree
 from torchstickcal.pipeline.initialise.pairs import relate
 from torchstickcal.pipeline.initialise.views import Views, undistorted_keypoints
 
-__all__ = ["initialise", "triangulated"]
+__all__ = ["initialise", "small_squared_residuals", "triangulated"]
 
 _SUPPORT_SCALE = 10.0
 """Scale of the robust kernels in units of the inlier threshold of RANSAC."""
 _RIGID, _RIGID_OF_TWO = 0.02, 0.01
 """Change of a stick's length, as a share of it, below which the start is near enough; with two cameras, no third view shows
 that it is not. Sound starts have 0.002 to 0.015, and more only among many outliers."""
+_MOST_SORTED = 100_003
 _CLEARLY_LESS, _AS_GOOD = 0.5, 4.0
 """Change of the lengths and squared residual from the ends alone, relative to those from all keypoints, up to which the ends
 are the start."""
@@ -87,9 +88,14 @@ def _change_of_lengths(measurements: Measurements, state: State) -> float:
 
 
 def _misfit(measurements: Measurements, state: State) -> float:
-    """The lower quartile of the squared residuals, square pixels: few outliers are among them."""
-    squared = measurements.squared_residuals(replace(state, unknowns=measurements.unknowns.given)).double()
-    return float(nanquantile(squared.where(measurements.visible, torch.nan).flatten(1), 0.25))
+    return float(small_squared_residuals(measurements, replace(state, unknowns=measurements.unknowns.given)))
+
+
+def small_squared_residuals(measurements: Measurements, state: State) -> Tensor:
+    """The lower quartile of each session's squared residuals, (B,), square pixels: few outliers are among them."""
+    squared = measurements.squared_residuals(state).double().where(measurements.visible, torch.nan).flatten(1)
+    step = -(-squared.shape[1] // _MOST_SORTED)
+    return nanquantile(squared[:, ::step], 0.25)
 
 
 def triangulated(

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator
 
 import torch
 
-from torchstickcal.quality.evidence import DOUBTFUL_SHARE, Evidence
+from torchstickcal.quality.evidence import DOUBTFUL_SHARE, Evidence, median_distances
 from torchstickcal.quality.finding import Finding, Severity
 from torchstickcal.quality.registry import findings
 
@@ -111,13 +110,8 @@ def _shares(evidence: Evidence) -> Iterator[Finding]:
 
 def _same_views(evidence: Evidence) -> Iterator[Finding]:
     """Pairs of cameras that see the points from the same place, and rigs that have no baseline at all."""
-    visible = evidence.measurements.visible[0]
     rays = torch.nn.functional.normalize(evidence.state.points - evidence.centres[..., None], dim=1)
-    angles: dict[tuple[int, int], float] = {}
-    for first in range(evidence.cameras - 1):
-        apart = (rays[first] - rays[first + 1 :]).square().sum(1).where(visible[first] & visible[first + 1 :], torch.nan)
-        medians = apart.nanmedian(1).values.sqrt().tolist()
-        angles |= {(first, second): angle for second, angle in enumerate(medians, first + 1) if not math.isnan(angle)}
+    angles = median_distances(rays, evidence.measurements.visible[0])
     same = {pair: angle for pair, angle in angles.items() if angle < _SAME_VIEW_RAD}
     for (first, second), angle in same.items():
         names = (evidence.camera(first), evidence.camera(second))

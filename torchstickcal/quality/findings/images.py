@@ -6,7 +6,7 @@ from collections.abc import Iterator
 
 import torch
 
-from torchstickcal.quality.evidence import Evidence
+from torchstickcal.quality.evidence import Evidence, median_distances
 from torchstickcal.quality.finding import Finding, Severity
 from torchstickcal.quality.registry import findings
 
@@ -105,21 +105,17 @@ def _same_video(evidence: Evidence) -> Iterator[Finding]:
     m = evidence.measurements
     frames = torch.linspace(0, m.frames - 1, min(m.frames, 200)).long()
     pixels, seen = m.by_frame(m.pixels[0])[:, :, frames].double(), m.by_frame(m.visible[0])[:, frames]
-    for first in range(evidence.cameras - 1):
-        squared = (pixels[first] - pixels[first + 1 :]).square().sum(1).where(seen[first] & seen[first + 1 :], torch.nan)
-        medians = squared.flatten(1).nanmedian(1).values.sqrt().tolist()
-        for second, distance in enumerate(medians, first + 1):
-            if distance < _SAME_PX:
-                names = (evidence.camera(first), evidence.camera(second))
-                yield Finding(
-                    "same_video",
-                    Severity.FATAL if evidence.cameras == 2 else Severity.SERIOUS,
-                    f"{names[0]} and {names[1]} have the same keypoints within {distance:.2g} px: one video was taken for "
-                    "both.",
-                    "Give each camera its own video.",
-                    cameras=names,
-                    figure=distance,
-                    limit=_SAME_PX,
-                    unit="px",
-                    is_cause=True,
-                )
+    for (first, second), distance in median_distances(pixels.flatten(2), seen.flatten(1)).items():
+        if distance < _SAME_PX:
+            names = (evidence.camera(first), evidence.camera(second))
+            yield Finding(
+                "same_video",
+                Severity.FATAL if evidence.cameras == 2 else Severity.SERIOUS,
+                f"{names[0]} and {names[1]} have the same keypoints within {distance:.2g} px: one video was taken for both.",
+                "Give each camera its own video.",
+                cameras=names,
+                figure=distance,
+                limit=_SAME_PX,
+                unit="px",
+                is_cause=True,
+            )

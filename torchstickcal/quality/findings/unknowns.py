@@ -20,7 +20,7 @@ _CLEAR_SIGMAS = 8.0
 """For values with a weak prior, which biased keypoints move easily."""
 _ASTRAY, _LEFT_SIGMAS = 0.1, 5.0
 """Error of a given focal length that was estimated, from which on such values are contradicted already by fewer standard
-deviations, and are serious: the focal length has explained most of what they would."""
+deviations, and are serious: a wrong focal length can take the place of most of their error."""
 _OPEN_SHARE = 0.5
 _WRONG_FOCAL = 0.02
 """Error of a focal length from which on the camera's distance is wrong by 2 %. Biased keypoints alone make 1 to 2 %."""
@@ -41,13 +41,12 @@ _WRONG_FRAMES = 0.5
 def unknowns(evidence: Evidence) -> Iterator[Finding]:
     """Findings about lenses and clocks."""
     for name, unknown in all_unknowns().items():
-        yield from _contradicted(evidence, unknown, evidence.unknowns[name])
+        contradicted = list(_contradicted(evidence, unknown, evidence.unknowns[name]))
+        yield from contradicted
         yield from _different(evidence, unknown, evidence.unknowns[name])
         yield from _undetermined(evidence, unknown, evidence.unknowns[name])
-    if evidence.observations.intrinsics_known and not any(
-        _contradicted(evidence, all_unknowns()["focal"], evidence.unknowns["focal"])
-    ):
-        yield from _all_focals(evidence)
+        if name == "focal" and not contradicted and evidence.observations.intrinsics_known:
+            yield from _all_focals(evidence)
 
 
 @findings("clocks", "cameras whose clocks are apart or uncertain, by the motion in the images")
