@@ -7,12 +7,12 @@ from typing import NamedTuple, Protocol, Self
 
 import torch
 from torch import Tensor
-from torch.autograd import forward_ad
 
-from torchstickcal.dual import dual_numbers, tangent
+from torchstickcal.dual import dual, dual_numbers, tangent
 from torchstickcal.geometry import projection
 from torchstickcal.geometry.cameras import Intrinsics, PixelMap
 from torchstickcal.geometry.symmetric import six_entries
+from torchstickcal.inference import differentiates
 from torchstickcal.losses.base import Loss, checked_residuals
 from torchstickcal.precision import in_common_precision, in_full_precision
 
@@ -237,9 +237,9 @@ class CameraPointLoss(Loss, ABC):
             step: how that changes, (..., C, k); None where it does not.
         """
         with dual_numbers():
-            moving = forward_ad.make_dual(points_cam, moved_cam)
+            moving = dual(points_cam, moved_cam)
             if unknowns is not None and step is not None:
-                cameras, pixels = unknowns.moved(forward_ad.make_dual(torch.zeros_like(step), step))
+                cameras, pixels = unknowns.moved(dual(torch.zeros_like(step), step))
             value = self.total(self._squared(moving, pixels, cameras) * information)
             return tangent(value) / 2
 
@@ -254,7 +254,7 @@ class CameraPointLoss(Loss, ABC):
         columns: list[Tensor] = []
         for axis in rotations.unbind(-1):
             with dual_numbers():
-                moving = forward_ad.make_dual(points_cam, axis.unsqueeze(-1).expand_as(points_cam))
+                moving = dual(points_cam, axis.unsqueeze(-1).expand_as(points_cam))
                 columns.append(tangent(self._residuals(moving.mT, pixels.mT, cameras)))
         pairs = [(columns[i] * columns[j]).sum(-1) for i in range(3) for j in range(i, 3)]
         return torch.stack([(weights * pair).sum(-2) for pair in pairs], dim=-2)
@@ -276,7 +276,7 @@ class CameraPointLoss(Loss, ABC):
         """:meth:`residuals`, checked."""
         return checked_residuals(self, self.residuals(points_cam, keypoints, cameras), points_cam.shape[:-1])
 
-    @torch.enable_grad()
+    @differentiates
     def _with_jacobian(self, points_cam: Tensor, pixels: Tensor, cameras: Intrinsics) -> tuple[Tensor, Tensor]:
         """Residuals (..., C, N, m), and their derivatives (..., C, N, m, 3) by the points in the cameras' frames."""
         at = points_cam.detach().mT.requires_grad_()
@@ -284,7 +284,7 @@ class CameraPointLoss(Loss, ABC):
         rows = [torch.autograd.grad(row.sum(), at, retain_graph=True)[0] for row in residuals.unbind(-1)]
         return residuals.detach(), torch.stack(rows, dim=-2)
 
-    @torch.enable_grad()
+    @differentiates
     def _exact_hessian(self, points_cam: Tensor, pixels: Tensor, information: Tensor, cameras: Intrinsics) -> Tensor:
         """Half the second derivatives (..., C, N, 3, 3) of the loss by the points in the cameras' frames."""
         at = points_cam.detach().requires_grad_()
@@ -300,6 +300,6 @@ class CameraPointLoss(Loss, ABC):
             direction = points_cam.new_zeros(*points_cam.shape[:-2], unknowns.components)
             direction[..., component] = 1.0
             with dual_numbers():
-                cameras, pixels = unknowns.moved(forward_ad.make_dual(torch.zeros_like(direction), direction))
+                cameras, pixels = unknowns.moved(dual(torch.zeros_like(direction), direction))
                 found.append(tangent(self.residuals(points_cam.mT, pixels.mT, cameras)))
         return torch.stack(found, dim=-3)

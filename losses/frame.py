@@ -7,11 +7,11 @@ from typing import NamedTuple
 
 import torch
 from torch import Tensor
-from torch.autograd import forward_ad
 
-from torchstickcal.dual import dual_numbers, tangent
+from torchstickcal.dual import dual, dual_numbers, tangent
 from torchstickcal.errors import ConfigError
 from torchstickcal.geometry.symmetric import six_entries
+from torchstickcal.inference import differentiates
 from torchstickcal.losses.base import Loss, checked_residuals
 from torchstickcal.precision import at_least_float32, in_full_precision
 
@@ -87,15 +87,12 @@ class FrameLoss(Loss, ABC):
         """
         groups = self.groups(sticks)
         known = active[..., groups].all(-1)
-        with torch.enable_grad():
-            at = _in_general_position(points[..., groups].movedim(-4, -1), known).detach().requires_grad_()
-            residuals = checked_residuals(self, self.residuals(at, lengths_m.detach()), at.shape[:-2])
-            rows = [torch.autograd.grad(row.sum(), at, retain_graph=True)[0] for row in residuals.unbind(-1)]
-        whitened = torch.where(known, residuals.detach().square().sum(-1), 0.0)
+        at = _in_general_position(points[..., groups].movedim(-4, -1), known)
+        residuals, jacobian = self._with_jacobian(at, lengths_m)
+        whitened = torch.where(known, residuals.square().sum(-1), 0.0)
         whitened = whitened * self.information(whitened)
         weights = self.weight * self.information(whitened) * known * self.kernel.weight(whitened)
-        jacobian = torch.stack(rows, dim=-3)
-        gradient = torch.einsum("...fgm,...fgmki,...fg->...kifg", residuals.detach(), jacobian, weights)
+        gradient = torch.einsum("...fgm,...fgmki,...fg->...kifg", residuals, jacobian, weights)
         if exact:
             hessian = self._exact_hessian(at, known, lengths_m)
         else:
@@ -117,7 +114,7 @@ class FrameLoss(Loss, ABC):
         known = active[..., groups].all(-1)
         at, along = (values[..., groups].movedim(-4, -1) for values in (points, moved))
         with dual_numbers():
-            squared = self._squared(forward_ad.make_dual(at, along), known, lengths_m)
+            squared = self._squared(dual(at, along), known, lengths_m)
             return tangent(self.total(squared * self.information(squared))) / 2
 
     def point_information(self, points: Tensor, sticks: Tensor, lengths_m: Tensor, active: Tensor) -> Tensor:
@@ -135,7 +132,7 @@ class FrameLoss(Loss, ABC):
                 along = torch.zeros_like(at)
                 along[..., member, axis] = 1.0
                 with dual_numbers():
-                    columns.append(tangent(self.residuals(forward_ad.make_dual(at, along), lengths_m)))
+                    columns.append(tangent(self.residuals(dual(at, along), lengths_m)))
             pairs = [weights * (columns[i] * columns[j]).sum(-1) for i in range(3) for j in range(i, 3)]
             found = found.index_add(-1, indices, torch.stack(pairs, dim=-3))
         return found
@@ -156,9 +153,18 @@ class FrameLoss(Loss, ABC):
             return groups
         raise ConfigError("unusable groups of points", where=f"{type(self).__name__}.groups", got=got, expected=expected)
 
-    @torch.enable_grad()
+    @differentiates
+    def _with_jacobian(self, grouped: Tensor, lengths_m: Tensor) -> tuple[Tensor, Tensor]:
+        """Residuals (..., F, G, m) of points (..., F, G, k, 3), and their derivatives by these, (..., F, G, m, k, 3)."""
+        at = grouped.detach().requires_grad_()
+        residuals = checked_residuals(self, self.residuals(at, lengths_m.detach()), at.shape[:-2])
+        rows = [torch.autograd.grad(row.sum(), at, retain_graph=True)[0] for row in residuals.unbind(-1)]
+        return residuals.detach(), torch.stack(rows, dim=-3)
+
+    @differentiates
     def _exact_hessian(self, grouped: Tensor, known: Tensor, lengths_m: Tensor) -> Tensor:
         """Half the second derivatives of the loss, blocks (..., F, G, k, k, 3, 3)."""
+        grouped = grouped.detach().requires_grad_()
         squared = self._squared(grouped, known, lengths_m)
         value = self.total(squared * self.information(squared))
         (gradient,) = torch.autograd.grad(value / 2, grouped, create_graph=True)

@@ -12,7 +12,7 @@ import torchstickcal
 
 ROOT = Path(__file__).parents[1]
 FLOORS = [
-    ["errors", "workers", "processes", "lazy", "precision", "samples", "dual"],
+    ["errors", "workers", "processes", "inference", "lazy", "precision", "samples", "dual"],
     ["files", "shapes", "arrays", "archives"],
     ["untrusted"],
     ["registry", "skeletons"],
@@ -32,7 +32,7 @@ FLOORS = [
     ["world"],
     ["result", "reconstruction"],
     ["io"],
-    ["pipeline.noise"],
+    ["pipeline.inference", "pipeline.noise"],
     ["pipeline.run", "pipeline.height", "pipeline.scale"],
     ["pipeline.stage"],
     ["pipeline.settle"],

@@ -11,6 +11,8 @@ import torch
 from torch import Tensor
 from torch.autograd import forward_ad
 
+from torchstickcal.inference import ordinary
+
 _in_use = threading.RLock()
 
 
@@ -20,13 +22,17 @@ def dual_numbers() -> Iterator[None]:
 
     Example:
         >>> import torch
-        >>> from torch.autograd.forward_ad import make_dual
         >>> with dual_numbers():
-        ...     tangent(make_dual(torch.tensor(3.0), torch.tensor(1.0)).square())
+        ...     tangent(dual(torch.tensor(3.0), torch.tensor(1.0)).square())
         tensor(6.)
     """
-    with _in_use, forward_ad.dual_level():
+    with _in_use, torch.inference_mode(mode=False), forward_ad.dual_level():  # in inference mode there are no dual numbers
         yield
+
+
+def dual(value: Tensor, direction: Tensor) -> Tensor:
+    """A value as a dual number, which carries its derivative along a direction through what is computed from it."""
+    return forward_ad.make_dual(ordinary(value), direction)
 
 
 def tangent(value: Tensor) -> Tensor:

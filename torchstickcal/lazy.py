@@ -5,6 +5,10 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any, Generic, TypeVar, overload
 
+from torch import Tensor
+
+from torchstickcal.inference import ordinary
+
 _Value = TypeVar("_Value")
 
 
@@ -13,7 +17,7 @@ class cached_property(Generic[_Value]):  # noqa: N801 as functools.cached_proper
 
     ``functools.cached_property`` of Python 3.11 holds a lock while it computes. A process that is forked meanwhile inherits the
     lock, but not the thread that would release it, and waits forever. This one has no lock, as from Python 3.12 on: two threads
-    that first need a value at the same time both compute it.
+    that first need a value at the same time both compute it. A tensor that is kept can take part in gradients.
 
     Example:
         >>> class Square:
@@ -43,5 +47,6 @@ class cached_property(Generic[_Value]):  # noqa: N801 as functools.cached_proper
         if instance is None:
             return self
         value = self._function(instance)
+        value = ordinary(value) if isinstance(value, Tensor) else value
         instance.__dict__[self._name] = value  # looked up before this descriptor from now on
         return value

@@ -146,9 +146,11 @@ def check_frame_rate(writers: dict[str, Writer], observations: Observations) -> 
 
 def write_page(path: Path, calibration: Calibration, made_of: dict[str, Any]) -> None:
     """Write ``report.html``; ``made_of`` is as of :func:`torchstickcal.show.page.page.report_page`."""
+    import torch
+
     from torchstickcal.show.page.page import report_page
 
-    with atomic_path(path) as temporary:
+    with atomic_path(path) as temporary, torch.inference_mode():
         temporary.write_text(report_page(calibration, made_of), "utf-8")
 
 

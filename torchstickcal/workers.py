@@ -59,7 +59,7 @@ def map_with_idle_workers(function: Callable[[_Item], _Result], items: Sequence[
         for number in open_items:
             results[number] = function(items[number])
 
-    helpers = [_pool.submit(_with_grad_mode(work)) for _ in range(min(_pool._max_workers, len(items)) - 1)]
+    helpers = [_pool.submit(_with_modes(work)) for _ in range(min(_pool._max_workers, len(items)) - 1)]
     try:
         work()
     finally:
@@ -71,6 +71,17 @@ def map_with_idle_workers(function: Callable[[_Item], _Result], items: Sequence[
 
 def _is_worker() -> bool:
     return getattr(_this_thread, "is_worker", False)
+
+
+def _with_modes(function: Callable[[], None]) -> Callable[[], None]:
+    """The function with this worker's gradient mode and inference mode."""
+    enabled, function = torch.is_inference_mode_enabled(), _with_grad_mode(function)
+
+    def run() -> None:
+        with torch.inference_mode(mode=enabled):
+            function()
+
+    return run
 
 
 def _with_grad_mode(function: Callable[_Arguments, _Result]) -> Callable[_Arguments, _Result]:

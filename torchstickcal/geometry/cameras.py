@@ -16,6 +16,7 @@ from torch import Tensor
 
 from torchstickcal.arrays import tensor_of
 from torchstickcal.errors import ObservationError
+from torchstickcal.inference import differentiates
 from torchstickcal.lazy import cached_property
 from torchstickcal.precision import at_least_float32
 from torchstickcal.shapes import extended
@@ -199,14 +200,14 @@ class Intrinsics:
             torch.addcmul(a * mixed_v, b, own_v),
         )
 
+    @differentiates
     def _curvature_by_autograd(self, u: Tensor, v: Tensor, along_x: Tensor, along_y: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """:meth:`pixel_curvature` of any lens."""
-        with torch.enable_grad():
-            u, v = u.detach().requires_grad_(), v.detach().requires_grad_()
-            m = self.pixels_with_jacobian(u, v)
-            by_u, by_v = along_x * m.dx_du + along_y * m.dy_du, along_x * m.dx_dv + along_y * m.dy_dv
-            uu, uv = torch.autograd.grad(by_u.sum(), (u, v), retain_graph=True)
-            (vv,) = torch.autograd.grad(by_v.sum(), v)
+        u, v = u.detach().requires_grad_(), v.detach().requires_grad_()
+        m = self.pixels_with_jacobian(u, v)
+        by_u, by_v = along_x * m.dx_du + along_y * m.dy_du, along_x * m.dx_dv + along_y * m.dy_dv
+        uu, uv = torch.autograd.grad(by_u.sum(), (u, v), retain_graph=True)
+        (vv,) = torch.autograd.grad(by_v.sum(), v)
         return uu, uv, vv
 
     def pixels_by_radial(self, u: Tensor, v: Tensor, order: int) -> tuple[Tensor, Tensor]:

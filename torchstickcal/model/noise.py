@@ -168,6 +168,7 @@ def _remaining_share(views: Tensor) -> Tensor:
 
 
 @lru_cache
+@torch.inference_mode(mode=False)
 def _truncated_moments(cameras: int, cut: float) -> Tensor:
     """Second moments of residuals below the cut, as fractions of the full moments, by the number of views from 0 to C."""
     half = _degrees(cameras) / 2
@@ -176,6 +177,7 @@ def _truncated_moments(cameras: int, cut: float) -> Tensor:
 
 
 @lru_cache
+@torch.inference_mode(mode=False)
 def _lower_quartiles(cameras: int) -> Tensor:
     """Lower quartiles of squared residuals with mean 2, by the number of views from 0 to C (Wilson and Hilferty 1931)."""
     spread = 2 / (9 * _degrees(cameras))

@@ -16,6 +16,7 @@ from torch import Tensor
 from torchstickcal.geometry import se3
 from torchstickcal.geometry.cameras import Intrinsics, PixelMap
 from torchstickcal.geometry.symmetric import IDENTITY, inverse_diagonal
+from torchstickcal.inference import differentiates, ordinary
 from torchstickcal.lazy import cached_property
 from torchstickcal.losses import CameraPointLoss, FrameLoss, Loss, TrackLoss
 from torchstickcal.losses.camera_point import CameraPointSlopes, CameraPointTerms, UnknownTerms
@@ -203,12 +204,12 @@ class Objective:
             found[name] = loss.slopes(points_cam, rotations, at.pixels, information, at.cameras, unknowns)
         return found
 
-    @torch.enable_grad()
+    @differentiates
     def _exact_by_unknowns(self, loss: CameraPointLoss, state: State, columns: Columns, information: Tensor) -> UnknownTerms:
         """A loss's terms with the exact Hessian at columns of information (B, C, n): the slope's derivatives, by autograd."""
         m = self.measurements
         points_cam = state.in_cameras(columns).detach().requires_grad_()
-        at = self._unknowns_at(state, columns)
+        at = ordinary(self._unknowns_at(state, columns))
         deviations = torch.zeros_like(m.unknowns.by_camera(state.unknowns)).requires_grad_()
         step = torch.zeros_like(deviations).requires_grad_()
         # copies: an unknown of a user may write into its own copy of a matrix

@@ -197,6 +197,7 @@ def shifted_in_time(values: Tensor, steps: Sequence[int]) -> Tensor:
 
 
 @lru_cache
+@torch.inference_mode(mode=False)
 def _basis(half_width: int, device: torch.device) -> tuple[Tensor, Tensor, Tensor]:
     """Orthonormal polynomials in a window.
 

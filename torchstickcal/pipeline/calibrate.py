@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any, Literal, NamedTuple, Protocol
 
 from torchstickcal.config import Config, Refine, load_config, with_noise, with_refine
 from torchstickcal.errors import RigError
+from torchstickcal.inference import ordinary
 from torchstickcal.losses import LOSSES
 from torchstickcal.model.unknowns import REFINEMENTS
 from torchstickcal.observations import Observations
@@ -17,6 +18,7 @@ from torchstickcal.pipeline.adjust import adjust_cameras, adjust_points
 from torchstickcal.pipeline.adjustment import Adjustment
 from torchstickcal.pipeline.check import CameraCheck
 from torchstickcal.pipeline.conclude import conclude
+from torchstickcal.pipeline.inference import inference_of
 from torchstickcal.pipeline.run import Run
 from torchstickcal.pipeline.scale import ending_in_scale
 from torchstickcal.pipeline.selection import ModelSelection
@@ -124,12 +126,13 @@ def _calibrated(
 ) -> Calibration:
     steps = calibration_steps(observations, config, callback, start, left_out)
     adjusted: Adjustment | None = None
-    while True:
-        try:
-            due = steps.send(adjusted)
-        except StopIteration as ended:
-            return ended.value
-        adjusted = due.adjust(due.adjustment, due.run)
+    with inference_of(observations, config, () if callback is None else (type(callback),)):
+        while True:
+            try:
+                due = steps.send(adjusted)
+            except StopIteration as ended:
+                return ended.value
+            adjusted = due.adjust(due.adjustment, due.run)
 
 
 class Due(NamedTuple):
@@ -181,7 +184,7 @@ def calibration_steps(
         return config.synchronise and "time_offset" not in ended.refined and models.clocks_unlike_given is not None
 
     run.took("total", time.perf_counter() - began)
-    calibration = conclude(ended, check, clocks, unsynchronised, left_out, models.start_contradicted, run)
+    calibration = ordinary(conclude(ended, check, clocks, unsynchronised, left_out, models.start_contradicted, run))
     if callback:
         callback.on_end(calibration)
     return calibration

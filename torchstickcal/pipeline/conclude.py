@@ -10,11 +10,13 @@ from torch import Tensor
 
 from torchstickcal.config import Config
 from torchstickcal.geometry.singular import definite
+from torchstickcal.inference import ordinary
 from torchstickcal.model.correlation import error_correlation
 from torchstickcal.model.unknowns import CameraUnknown, RigEstimate, all_unknowns
 from torchstickcal.pipeline.adjustment import Adjustment
 from torchstickcal.pipeline.check import CameraCheck
 from torchstickcal.pipeline.height import HEIGHT_STD
+from torchstickcal.pipeline.inference import inference_of
 from torchstickcal.pipeline.run import Run
 from torchstickcal.pipeline.scale import height_sets_scale
 from torchstickcal.pipeline.synchronise import ClockEstimate, CommonFrames
@@ -101,7 +103,8 @@ def evidence_of(
     """What the quality of one session is judged by; arguments as of :func:`conclude`."""
     noise, ruler = _covariances(ended, config)
     tangents = 6 * (ended.measurements.num_cameras - 1)
-    unknowns = _unknowns(ended, check, (noise + ruler)[tangents:, tangents:])
+    mode = partial(inference_of, ended.observations[0], config)
+    unknowns = _unknowns(ended, check, (noise + ruler)[tangents:, tangents:], mode)
     return Evidence(ended, unknowns, noise, ruler, clocks, unsynchronised, left_out, config, start_contradicted, check)
 
 
@@ -141,7 +144,9 @@ def _covariances(ended: Adjustment, config: Config) -> tuple[Tensor, Tensor]:
     return noise, ruler_covariance(kept, last.state, sigma_px)
 
 
-def _unknowns(ended: Adjustment, check: CameraCheck, covariance: Tensor) -> dict[str, CameraParameter]:
+def _unknowns(
+    ended: Adjustment, check: CameraCheck, covariance: Tensor, mode: Callable[[], torch.inference_mode]
+) -> dict[str, CameraParameter]:
     """Everything that can be unknown of the cameras beside their poses, refined or not, in its own unit."""
     observations, frames, measurements = ended.observations[0], ended.frames[0], ended.measurements
     found = {name: own[0] for name, own in measurements.unknowns.by_name(ended.state.unknowns).items()}
@@ -167,18 +172,25 @@ def _unknowns(ended: Adjustment, check: CameraCheck, covariance: Tensor) -> dict
             std=_own(variances[name].sqrt() * factor.abs() if name in found else torch.full_like(value, torch.nan)),
             given=_own(given),
             prior_std=_own(unknown.prior(estimate.given) * factor.abs()),
-            suggestion=partial(_suggestion, check, unknown, estimate),
+            suggestion=partial(_suggestion, check, unknown, estimate, mode),
         )
     return parameters
 
 
-def _suggestion(check: CameraCheck, unknown: CameraUnknown, estimate: RigEstimate) -> tuple[Tensor, Tensor]:
+def _suggestion(
+    check: CameraCheck, unknown: CameraUnknown, estimate: RigEstimate, mode: Callable[[], torch.inference_mode]
+) -> tuple[Tensor, Tensor]:
     """What the keypoints suggest for something that may be unknown of the cameras, and its standard deviation, in its unit."""
-    deviation, std = on_worker(estimate.found.matrix.device, check.suggestion, unknown.name)
-    deviations = estimate.deviations | {unknown.name: estimate.deviations[unknown.name] + deviation}
-    moved = estimate._replace(found=unknown.applied(estimate.found, deviation), deviations=deviations)
-    _, _, factor = unknown.in_units(estimate)
-    return _own(unknown.in_units(moved).value), _own(std * factor.abs())
+
+    def found() -> tuple[Tensor, Tensor]:
+        with mode():
+            deviation, std = check.suggestion(unknown.name)
+            deviations = estimate.deviations | {unknown.name: estimate.deviations[unknown.name] + deviation}
+            moved = estimate._replace(found=unknown.applied(estimate.found, deviation), deviations=deviations)
+            _, _, factor = unknown.in_units(estimate)
+            return ordinary((_own(unknown.in_units(moved).value), _own(std * factor.abs())))
+
+    return on_worker(estimate.found.matrix.device, found)
 
 
 def _own(values: Tensor) -> Tensor:

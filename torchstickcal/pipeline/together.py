@@ -14,6 +14,7 @@ from torchstickcal.config import Config
 from torchstickcal.observations import Observations
 from torchstickcal.pipeline.adjustment import Adjustment
 from torchstickcal.pipeline.calibrate import Due, calibration_steps
+from torchstickcal.pipeline.inference import inference_of
 from torchstickcal.pipeline.run import Run
 from torchstickcal.result import Calibration
 from torchstickcal.workers import on_worker
@@ -37,11 +38,12 @@ def calibrate_together(sessions: Sequence[Observations], config: Config) -> list
 
 def _together(sessions: Sequence[Observations], config: Config) -> list[Calibration | None]:
     every = [_Session(session, config) for session in sessions]
-    for session in every:
-        session.go_on()
-    while waiting := [session for session in every if session.due]:
-        for alike in _alike(waiting):
-            _adjust(alike, config)
+    with inference_of(max(sessions, key=lambda session: session.keypoints.numel()), config):
+        for session in every:
+            session.go_on()
+        while waiting := [session for session in every if session.due]:
+            for alike in _alike(waiting):
+                _adjust(alike, config)
     return [session.found for session in every]
 
 

@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import torch
 
+from torchstickcal.pipeline.inference import inference_of
 from torchstickcal.quality.evidence import Evidence
 from torchstickcal.quality.finding import Finding, Severity
 from torchstickcal.quality.registry import FAMILIES, Family
@@ -27,17 +28,18 @@ def judged(evidence: Evidence) -> Quality:
 
 
 def _judged(evidence: Evidence) -> Quality:
-    found = {family: _findings(family, evidence) for family in FAMILIES.values() if not family.tries}
-    large = [finding for family, own in found.items() if not family.small for finding in own]
-    small = [finding for family, own in found.items() if family.small for finding in own]
-    if not evidence.consistent and any(finding.is_cause for finding in large):
-        small = [_as_effect(finding) for finding in small]
-    causes: list[Finding] = []
-    if _worth_trying(evidence, found):
-        causes = [finding for family in FAMILIES.values() if family.tries for finding in _findings(family, evidence)]
-    if any(finding.is_cause for finding in causes):
-        large = list(_as_effects(found))
-    return Quality.of([*causes, *large, *([] if causes else small)], _acceptance(evidence))
+    with inference_of(evidence.observations, evidence.config, (family.look for family in FAMILIES.values())):
+        found = {family: _findings(family, evidence) for family in FAMILIES.values() if not family.tries}
+        large = [finding for family, own in found.items() if not family.small for finding in own]
+        small = [finding for family, own in found.items() if family.small for finding in own]
+        if not evidence.consistent and any(finding.is_cause for finding in large):
+            small = [_as_effect(finding) for finding in small]
+        causes: list[Finding] = []
+        if _worth_trying(evidence, found):
+            causes = [finding for family in FAMILIES.values() if family.tries for finding in _findings(family, evidence)]
+        if any(finding.is_cause for finding in causes):
+            large = list(_as_effects(found))
+        return Quality.of([*causes, *large, *([] if causes else small)], _acceptance(evidence))
 
 
 def _worth_trying(evidence: Evidence, found: dict[Family, list[Finding]]) -> bool:

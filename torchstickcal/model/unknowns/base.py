@@ -14,9 +14,8 @@ from typing import ClassVar, Literal, NamedTuple
 
 import torch
 from torch import Tensor
-from torch.autograd import forward_ad
 
-from torchstickcal.dual import dual_numbers, tangent
+from torchstickcal.dual import dual, dual_numbers, tangent
 from torchstickcal.geometry.cameras import Intrinsics, PixelMap
 
 Columns = slice | Tensor
@@ -213,4 +212,4 @@ def _derivative(function: Callable[[Tensor], tuple[Tensor, ...]], at: Tensor, co
     direction = torch.zeros_like(at)
     direction[..., component] = 1.0
     with dual_numbers():
-        return tuple(map(tangent, function(forward_ad.make_dual(at, direction))))
+        return tuple(map(tangent, function(dual(at, direction))))

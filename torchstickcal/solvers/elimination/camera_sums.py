@@ -100,6 +100,7 @@ _PRODUCTS = ([0, 0, 0, 0, 1, 1, 1, 2, 2, 3], [0, 1, 2, 3, 1, 2, 3, 2, 3, 3])
 
 
 @lru_cache(maxsize=8)
+@torch.inference_mode(mode=False)
 def _moment_maps(device: torch.device) -> tuple[Tensor, Tensor]:
     """Linear maps from the moments of g (12) to B^T g, (12, 6), and from the moments of N (60) to B^T N B, (60, 36).
 
