@@ -1,8 +1,8 @@
 """Torch's inference mode, without what it leaves in results.
 
-In inference mode operations skip what gradients would need, and take a tenth less time. A tensor that was made there can take no
-part in gradients. None of them leaves: results, and what objects keep, are made ordinary. So are the arguments of functions that
-differentiate.
+In inference mode operations skip what gradients would need, and take a tenth less time. A tensor that was made there can take
+no part in gradients. None of them leaves: results, and what objects keep, are made ordinary. So are the arguments of functions
+that differentiate.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ _Value = TypeVar("_Value")
 def ordinary(value: _Value) -> _Value:
     """A value with ordinary tensors in the place of those that were made in inference mode.
 
-    Tensors are looked for in tuples, dictionaries, dataclasses and modules, not in functions. What has none of them is the same object.
+    Tensors are looked for in tuples, dictionaries, dataclasses and modules, not in functions.
 
     Example:
         >>> import torch

@@ -144,7 +144,8 @@ class _Rig:
         prior = pull.new_tensor([1 / _PRIOR_M**2] * 3 + [1 / _PRIOR_RAD**2] * 3).diag()
         change = torch.linalg.solve(own + prior, pull)
         parts = self.pulls.information[:, place, place]
-        scatter = max(1.0, variance_of_sums(self.pulls.gradient_by_part[:, camera] - parts @ change, parts, _BLOCKS))
+        left = self.pulls.gradient_by_part[:, camera] - parts @ change
+        scatter = max(1.0, float(variance_of_sums(left, parts, _BLOCKS)))
         covariance = scatter * torch.linalg.inv(own + prior)
         if not exact:
             covariance = covariance + self.old.variance_of(camera).to(pull)

@@ -80,22 +80,22 @@ class FramePulls:
         return int((self.part == part).nonzero()[0])
 
 
-def variance_of_sums(pull: Tensor, own: Tensor, blocks: Sequence[int]) -> float:
-    """Variance of sums of pulls (K, 6), over that of independent keypoints with the noise that they were found to have.
+def variance_of_sums(pull: Tensor, own: Tensor, blocks: Sequence[int]) -> Tensor:
+    """Variance (...) of sums of pulls (..., K, 6), over that of independent keypoints with the noise that was found for them.
 
     It is the largest of that of single parts, and of sums over each number of blocks of parts.
 
     Args:
-        pull: of one camera.
-        own: information about it, (K, 6, 6).
+        pull: of one camera, or of each of several.
+        own: information about it, (..., K, 6, 6).
         blocks: numbers of blocks.
     """
-    white = pull @ covariance_root(own.mean(0))
-    found = []
-    for length in {1, *(max(1, len(white) // count) for count in blocks)}:
-        sums = white[: len(white) // length * length].unflatten(0, (-1, length)).sum(1) / length**0.5
-        found.append(float(sums.square().mean()))
-    return max(found)
+    white = pull @ covariance_root(own.mean(-3))
+    parts, found = white.shape[-2], list[Tensor]()
+    for length in {1, *(max(1, parts // count) for count in blocks)}:
+        sums = white[..., : parts // length * length, :].unflatten(-2, (-1, length)).sum(-2) / length**0.5
+        found.append(sums.square().mean((-2, -1)))
+    return torch.stack(found).amax(0)
 
 
 def _reduced(gradients: Tensor, blocks: Tensor, points: Tensor, seen: Tensor, per_frame: int) -> tuple[Tensor, Tensor]:

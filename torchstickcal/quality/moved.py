@@ -77,7 +77,7 @@ def motion_of(pulls: FramePulls, rotations: Tensor, translations: Tensor) -> Mot
         return None
     system = _System.of(pulls)
     poses = list(zip(rotations, translations, strict=True))
-    found = [_best_change(system, camera, _motions(*pose)) for camera, pose in enumerate(poses)]
+    found = _best_changes(system, _motions(rotations, translations))
     order = sorted(range(len(found)), key=lambda camera: -found[camera].strength)
     camera, best = order[0], found[order[0]]
     like_turn = best.like_turn
@@ -119,7 +119,10 @@ class _System(NamedTuple):
 
 
 class _Asked(NamedTuple):
-    """Changes that n weighted sums of the pulls at one camera ask for: three turns about its centre, then three shifts."""
+    """Changes that n weighted sums of the pulls at one camera ask for: three turns about its centre, then three shifts.
+
+    They are those before one of some parts, and at last that which goes on over the whole session.
+    """
 
     root: Tensor
     """(n, 6, 6), Cholesky factor of the information about the change"""
@@ -129,13 +132,15 @@ class _Asked(NamedTuple):
     """(6, 6), tangents of the turns and shifts"""
 
     @staticmethod
-    def by(pull: Tensor, own: Tensor, rows: Tensor, system: _System, motions: Tensor) -> _Asked:
-        """By sums of the pulls (n, 6), of the information about the camera (n, 6, 6), and about all of them (n, 6, 6 C)."""
+    def by(pull: Tensor, own: Tensor, rows: Tensor, covariance: Tensor, motions: Tensor) -> list[_Asked]:
+        """Of each camera, by sums of the pulls (C, n, 6), of the information about the camera (C, n, 6, 6), and about all of
+        them (C, n, 6, 6 C), with the covariance of all poses and the motions (C, 6, 6)."""
         prior = pull.new_tensor([1 / _PRIOR_RAD**2] * 3 + [1 / _PRIOR_M**2] * 3).diag()
-        left = motions.mT @ (own - rows @ system.covariance @ rows.mT) @ motions + prior
+        each = motions[:, None]
+        left = each.mT @ (own - rows @ covariance @ rows.mT) @ each + prior
         root = torch.linalg.cholesky_ex(left).L
         pulled = torch.linalg.solve_triangular(root, (pull @ motions)[..., None], upper=False)[..., 0]
-        return _Asked(root, pulled.nan_to_num(), motions)
+        return list(map(_Asked, root, pulled.nan_to_num(), motions))
 
     @property
     def of_turn(self) -> Tensor:
@@ -151,6 +156,10 @@ class _Asked(NamedTuple):
     def strength(self) -> Tensor:
         """(n,), evidence over the least that a change needs, without regard to lasting errors."""
         return torch.maximum(self.of_turn / LEAST_EVIDENCE, self.of_any / LEAST_EVIDENCE_OF_ANY)
+
+    def is_turn(self, index: int) -> bool:
+        """Whether one of the changes is found as a turn, rather than as a change of any kind."""
+        return float(self.of_turn[index]) / LEAST_EVIDENCE > float(self.of_any[index]) / LEAST_EVIDENCE_OF_ANY
 
     def tangent(self, index: int, size: int) -> Tensor:
         """(6,), one of the changes: a turn for a size of 3, the whole change for 6."""
@@ -188,47 +197,43 @@ class _Change(NamedTuple):
     @property
     def part_error(self) -> int:
         """Parts by which it may be at another one, by the likelihood of the others; 0 for a drift."""
-        evidence = self.asked.of_turn if self.turned else self.asked.of_any
+        if self.gradual:
+            return 0
+        evidence = (self.asked.of_turn if self.turned else self.asked.of_any)[:-1]
         likelihood = torch.softmax(evidence / (2 * self.variance), dim=0)
         distances = (torch.arange(len(evidence), device=evidence.device) - self.chosen).abs()
         within = torch.zeros_like(likelihood).index_add_(0, distances, likelihood)
         return int((within.cumsum(0) < _CERTAIN).sum())
 
 
-def _motions(rotation: Tensor, translation: Tensor) -> Tensor:
-    """Tangents (6, 6) that turn a camera about its centre, around its own axes, and that shift it along them."""
-    axes = rotation.mT
-    centre = se3.camera_centres(rotation, translation)
-    turns = torch.cat([torch.linalg.cross(centre[:, None].expand_as(axes), axes, dim=0), axes])
-    return torch.cat([turns, torch.cat([axes, torch.zeros_like(axes)])], dim=1)
+def _motions(rotations: Tensor, translations: Tensor) -> Tensor:
+    """Tangents (C, 6, 6) that turn each camera about its centre, around its own axes, and that shift it along them."""
+    axes = rotations.mT
+    centres = se3.camera_centres(rotations, translations)
+    turns = torch.cat([torch.linalg.cross(centres[..., None].expand_as(axes), axes, dim=1), axes], dim=1)
+    return torch.cat([turns, torch.cat([axes, torch.zeros_like(axes)], dim=1)], dim=2)
 
 
-def _best_change(system: _System, camera: int, motions: Tensor) -> _Change:
-    """The best change of one camera: at once, before one of some parts, or gradually over the session."""
-    place = slice(6 * camera, 6 * camera + 6)
-    pull, rows = system.pull[:, camera], system.information[:, place]
-    own, parts = rows[..., place], len(pull)
+def _best_changes(system: _System, motions: Tensor) -> list[_Change]:
+    """The best change of each camera: at once, before one of some parts, or gradually over the session."""
+    parts, cameras = system.pull.shape[:2]
     edge = max(2, round(_EDGE * parts))
-    steps = torch.arange(edge, parts - edge + 1, device=pull.device)
-    rows_after = _from(rows)[steps]
-    at_once = _Asked.by(_from(pull)[steps], rows_after[..., place], rows_after, system, motions)
-    ramp = torch.linspace(-0.5, 0.5, parts).to(pull)
-    rows_along = (ramp @ rows.flatten(1)).view(1, 6, -1)
-    squared = (ramp.square() @ own.flatten(1)).view(1, 6, 6)
-    along = _Asked.by((ramp @ pull)[None], squared, rows_along, system, motions)
-    strength = at_once.strength
-    best = int(strength.argmax())
-    gradual = float(along.strength[0]) > float(strength[best])
-    asked, index = (along, 0) if gradual else (at_once, best)
-    share = ramp if gradual else (torch.arange(parts, device=pull.device) >= steps[best]).to(pull)
-    turned = float(asked.of_turn[index]) / LEAST_EVIDENCE > float(asked.of_any[index]) / LEAST_EVIDENCE_OF_ANY
-    change = asked.tangent(index, 3 if turned else 6)
-    others = system.covariance @ ((rows_along[0] if gradual else rows_after[best]).mT @ change)
-    explained = rows @ others - share[:, None] * (own @ change)
-    variance = max(variance_of_sums(pull - explained, own, _BLOCKS), _LEAST_VARIANCE)
-    return _Change(asked, index, turned, variance, int(steps[best]), gradual)
-
-
-def _from(values: Tensor) -> Tensor:
-    """Sums of values (K, ...) from each place to the end."""
-    return values.flip(0).cumsum(0).flip(0)
+    steps = torch.arange(edge, parts - edge + 1, device=system.pull.device)
+    ramp = torch.linspace(-0.5, 0.5, parts).to(system.pull)
+    shares = torch.cat([(torch.arange(parts, device=steps.device) >= steps[:, None]).to(ramp), ramp[None]])  # (n, K)
+    pull, rows = system.pull.transpose(0, 1), system.information.unflatten(1, (cameras, 6)).transpose(0, 1)
+    own = rows.unflatten(3, (cameras, 6)).diagonal(dim1=0, dim2=3).movedim(-1, 0)  # (C, K, 6, 6)
+    changed = torch.tensordot(shares, rows, ([1], [1])).transpose(0, 1)  # (C, n, 6, 6 C)
+    about_own = torch.tensordot(shares.square(), own, ([1], [1])).transpose(0, 1)
+    asked = _Asked.by(shares @ pull, about_own, changed, system.covariance, motions)
+    best = [int(one.strength.argmax()) for one in asked]
+    turned = [one.is_turn(n) for one, n in zip(asked, best, strict=True)]
+    change = torch.stack([one.tangent(n, 3 if turn else 6) for one, n, turn in zip(asked, best, turned, strict=True)])
+    chosen = torch.stack([changed[camera, n] for camera, n in enumerate(best)])
+    others = system.covariance @ (chosen.mT @ change[..., None])
+    explained = (rows @ others[:, None])[..., 0] - shares[best][..., None] * (own @ change[:, None, :, None])[..., 0]
+    variances = variance_of_sums(pull - explained, own, _BLOCKS).clamp_min(_LEAST_VARIANCE).tolist()
+    return [
+        _Change(one, n, turn, variance, edge + n, gradual=n == len(steps))
+        for one, n, turn, variance in zip(asked, best, turned, variances, strict=True)
+    ]
