@@ -73,15 +73,16 @@ class StickLengthLoss(FrameLoss):
         residual = length - lengths_m
         squared = residual.square() * information
         weights = self.weight * information * self.kernel.weight(squared)
-        along, across = weights, torch.zeros_like(weights)
+        direction, pull = difference / length.unsqueeze(-3), weights * residual
+        entries = outer(direction.flatten(-2)).unflatten(-1, length.shape[-2:])
         if exact:
-            along = along + 2 * self.weight * information * self.kernel.curvature(squared) * squared
-            across = weights * residual / length
-        direction = difference / length.unsqueeze(-3)
-        entries = outer(direction.flatten(-2)).unflatten(-1, length.shape[-2:]) * (along - across).unsqueeze(-3)
-        for entry in DIAGONAL:
-            entries[..., entry, :, :] += across
-        gradient = direction * (weights * residual).unsqueeze(-3)
+            across = pull / length
+            along = weights + 2 * self.weight * information * self.kernel.curvature(squared) * squared
+            entries = entries * (along - across).unsqueeze(-3)
+            entries[..., DIAGONAL, :, :] += across.unsqueeze(-3)
+        else:
+            entries = entries * weights.unsqueeze(-3)
+        gradient = direction * pull.unsqueeze(-3)
         return FrameTerms(
             cost=self.total(squared, over=2),
             gradient=torch.stack([-gradient, gradient], dim=-4),

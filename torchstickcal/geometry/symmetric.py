@@ -6,6 +6,8 @@ over all N entry by entry.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import torch
 from torch import Tensor
 
@@ -65,6 +67,27 @@ def are_definite(entries: Tensor) -> Tensor:
 
 def cholesky(entries: Tensor) -> Tensor:
     """Factors (..., 6, N) as 1/l00 l10 l20 1/l11 l21 1/l22; pivots are kept above rounding."""
+    return torch.stack(_factors(entries), dim=-2)
+
+
+def forward(lower: Tensor, rhs: Tensor) -> Tensor:
+    """``L^-1 b`` for right-hand sides (..., 3, N)."""
+    return torch.stack(_forward(lower.unbind(-2), rhs.unbind(-2)), dim=-2)
+
+
+def backward(lower: Tensor, rhs: Tensor) -> Tensor:
+    """``L^-T b`` for right-hand sides (..., 3, N)."""
+    return torch.stack(_backward(lower.unbind(-2), rhs.unbind(-2)), dim=-2)
+
+
+def solve(entries: Tensor, rhs: Tensor) -> Tensor:
+    """``A^-1 b`` for positive definite matrices (..., 6, N) and right-hand sides (..., 3, N)."""
+    factors = _factors(entries)
+    return torch.stack(_backward(factors, _forward(factors, rhs.unbind(-2))), dim=-2)
+
+
+def _factors(entries: Tensor) -> tuple[Tensor, ...]:
+    """Each of those of :func:`cholesky`, (..., N)."""
     floor = _RELATIVE_PIVOT_FLOOR[entries.dtype]
     xx, xy, xz, yy, yz, zz = entries.unbind(-2)
     r0 = xx.rsqrt()
@@ -73,33 +96,25 @@ def cholesky(entries: Tensor) -> Tensor:
     l21 = torch.addcmul(yz, l20, l10, value=-1) * r1
     pivot = torch.addcmul(zz, l20, l20, value=-1).addcmul_(l21, l21, value=-1)
     r2 = torch.maximum(pivot, zz * floor).rsqrt()
-    return torch.stack([r0, l10, l20, r1, l21, r2], dim=-2)
+    return r0, l10, l20, r1, l21, r2
 
 
-def forward(lower: Tensor, rhs: Tensor) -> Tensor:
-    """``L^-1 b`` for right-hand sides (..., 3, N)."""
-    r0, l10, l20, r1, l21, r2 = lower.unbind(-2)
-    b0, b1, b2 = rhs.unbind(-2)
+def _forward(factors: Sequence[Tensor], rhs: Sequence[Tensor]) -> tuple[Tensor, ...]:
+    r0, l10, l20, r1, l21, r2 = factors
+    b0, b1, b2 = rhs
     x = b0 * r0
     y = torch.addcmul(b1, l10, x, value=-1) * r1
     z = torch.addcmul(b2, l20, x, value=-1).addcmul_(l21, y, value=-1) * r2
-    return torch.stack([x, y, z], dim=-2)
+    return x, y, z
 
 
-def backward(lower: Tensor, rhs: Tensor) -> Tensor:
-    """``L^-T b`` for right-hand sides (..., 3, N)."""
-    r0, l10, l20, r1, l21, r2 = lower.unbind(-2)
-    b0, b1, b2 = rhs.unbind(-2)
+def _backward(factors: Sequence[Tensor], rhs: Sequence[Tensor]) -> tuple[Tensor, ...]:
+    r0, l10, l20, r1, l21, r2 = factors
+    b0, b1, b2 = rhs
     z = b2 * r2
-    y = (b1 - l21 * z) * r1
-    x = (b0 - l10 * y - l20 * z) * r0
-    return torch.stack([x, y, z], dim=-2)
-
-
-def solve(entries: Tensor, rhs: Tensor) -> Tensor:
-    """``A^-1 b`` for positive definite matrices (..., 6, N) and right-hand sides (..., 3, N)."""
-    lower = cholesky(entries)
-    return backward(lower, forward(lower, rhs))
+    y = torch.addcmul(b1, l21, z, value=-1) * r1
+    x = torch.addcmul(b0, l10, y, value=-1).addcmul_(l20, z, value=-1) * r0
+    return x, y, z
 
 
 def inverse_diagonal(entries: Tensor) -> Tensor:

@@ -114,15 +114,21 @@ def triangulate(
         current = (
             weights / (1 + _squared_residuals(rotations, translations, rays, start.unsqueeze(-3)) / scale / scale).square()
         )
+    towards, bend = rotations[..., 2, :], 1 / scale / scale
     points = depth = rays.new_empty(0)
     for iteration in range(iterations):
         if iteration:
-            depth = (rotations[..., 2, :] @ points + translations[..., 2:]).clamp_min(_MIN_DEPTH)
-            algebraic = (rows * points.unsqueeze(-3)).sum(-2) - targets
-            squared = algebraic.square().sum(0) / depth.square()
-            current = weights / (depth * (1 + squared / scale / scale)).square()
+            depth = torch.add(towards @ points, by_third).clamp_min(_MIN_DEPTH)
+            algebraic = (rows * points.unsqueeze(-3)).sum(-2).sub_(targets)
+            squared = algebraic.square().sum(0)
+            current = weights / torch.addcdiv(depth, squared * bend, depth).square()
         share, before = current.unsqueeze(-2), points
         points = solve(torch.where(unseen, identity, (products * share).sum(-3)), (moments * share).sum(-3))
-        if iteration and bool(((points - before).abs() <= _SAME_PLACE * depth.amin(-2, keepdim=True)).all()):
+        if 0 < iteration < iterations - 1 and _are_near(points, before, depth):
             break
     return points.where(~unseen, torch.nan)
+
+
+def _are_near(points: Tensor, before: Tensor, depth: Tensor) -> bool:
+    """Whether no point (..., 3, N) has moved by more than a share of its least depth, of (..., C, N)."""
+    return bool(((points - before).abs() <= _SAME_PLACE * depth.amin(-2, keepdim=True)).all())

@@ -26,10 +26,12 @@ def shrunk_logarithms(
     weights = sampling.reciprocal() * known
     mean = _weighted_mean(logarithms, weights)
     between = _weighted_mean((logarithms - mean).square() - sampling, weights).clamp_min(least)
-    mean = _weighted_mean(logarithms, 1 / (between + sampling))
-    drawn = (mean - logarithms) * sampling / (between + sampling)
-    limit = farthest * sampling.sqrt()
-    return logarithms + drawn.clamp(-limit, limit)
+    total = between + sampling
+    drawn = (_weighted_mean(logarithms, total.reciprocal()) - logarithms) * sampling / total
+    if farthest < math.inf:
+        limit = farthest * sampling.sqrt()
+        drawn = drawn.clamp(-limit, limit)
+    return logarithms + drawn
 
 
 def _weighted_mean(values: Tensor, weights: Tensor) -> Tensor:
