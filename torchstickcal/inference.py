@@ -47,12 +47,14 @@ def differentiates(function: Callable[_Arguments, _Value]) -> Callable[_Argument
             with torch.enable_grad():
                 return function(*arguments, **keywords)
         with torch.inference_mode(mode=False), torch.enable_grad():
-            return function(*_ordinary(arguments), **_ordinary(keywords))
+            return function(*ordinary(arguments), **ordinary(keywords))
 
     return with_gradients
 
 
 def _ordinary(value: Any) -> Any:
+    if value is None or isinstance(value, float | int | str):
+        return value
     if isinstance(value, Tensor):
         return value.clone() if value.is_inference() else value
     if isinstance(value, dict):

@@ -17,6 +17,7 @@ from torch import Tensor
 
 from torchstickcal.geometry.singular import solve_information
 from torchstickcal.geometry.symmetric import IDENTITY, backward, cholesky, expand, forward, solve
+from torchstickcal.geometry.vectors import lengths
 from torchstickcal.losses import ReprojectionLoss
 from torchstickcal.model.measurements import Measurements
 from torchstickcal.model.objective import Objective
@@ -131,7 +132,7 @@ def _predicted(part: Adjustment, kept: Measurements, noise: Tensor, ruler: Tenso
     for number, (start, end) in enumerate(ends.sticks.tolist()):
         known = active[:, start] & active[:, end]
         along = points[..., end] - points[..., start]
-        length = along.norm(dim=0)
+        length = lengths(along)
         unit = along / length.clamp_min(1e-12)
         of_start, of_end = (forward(lower[..., point], unit) for point in (start, end))
         keypoints = (of_start.square() + of_end.square()).sum(0)

@@ -11,6 +11,7 @@ from torch import Tensor
 
 from torchstickcal.config import Config
 from torchstickcal.geometry import se3
+from torchstickcal.geometry.vectors import directions, lengths
 from torchstickcal.lazy import cached_property
 from torchstickcal.model.correlation import error_correlation
 from torchstickcal.model.measurements import Measurements
@@ -389,6 +390,6 @@ def without_depth(points: Tensor, centres: Tensor, seen: Tensor) -> Tensor:
     """
     mean = torch.zeros_like(points)
     for centre, own in zip(centres, seen, strict=True):
-        mean += torch.nn.functional.normalize(points - centre[:, None], dim=0) * own
-    length = mean.norm(dim=0) / seen.sum(0).clamp_min(1)
+        mean += directions(points - centre[:, None]) * own
+    length = lengths(mean) / seen.sum(0).clamp_min(1)
     return length > math.cos(math.radians(_LEAST_PARALLAX_DEG / 2))

@@ -7,6 +7,8 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
+from torchstickcal.geometry.vectors import lengths
+
 MIRRORED_SHARE = 0.8
 """Share of the frames in which the right side is on the left, from which on a scene is mirrored."""
 _LEAST_FRAMES = 15
@@ -51,6 +53,6 @@ def mirrored_share(points: Tensor, names: Sequence[str] | None) -> float:
     if nose is not None and ears is not None:
         forward = forward + 2 * (nose - ears).nan_to_num()
     handed = (right * torch.linalg.cross(forward, up, dim=0)).sum(0)
-    size = right.norm(dim=0) * forward.norm(dim=0) * up.norm(dim=0)
+    size = lengths(right) * lengths(forward) * lengths(up)
     clear = handed.isfinite() & (handed.abs() > _CLEAR * size) & (size > 0)
     return float((handed[clear] < 0).double().mean()) if int(clear.sum()) >= _LEAST_FRAMES else 0.0

@@ -223,8 +223,8 @@ def _best_changes(system: _System, motions: Tensor) -> list[_Change]:
     shares = torch.cat([(torch.arange(parts, device=steps.device) >= steps[:, None]).to(ramp), ramp[None]])  # (n, K)
     pull, rows = system.pull.transpose(0, 1), system.information.unflatten(1, (cameras, 6)).transpose(0, 1)
     own = rows.unflatten(3, (cameras, 6)).diagonal(dim1=0, dim2=3).movedim(-1, 0)  # (C, K, 6, 6)
-    changed = torch.tensordot(shares, rows, ([1], [1])).transpose(0, 1)  # (C, n, 6, 6 C)
-    about_own = torch.tensordot(shares.square(), own, ([1], [1])).transpose(0, 1)
+    changed = torch.einsum("nk,ckij->cnij", shares, rows)
+    about_own = torch.einsum("nk,ckij->cnij", shares.square(), own)
     asked = _Asked.by(shares @ pull, about_own, changed, system.covariance, motions)
     best = [int(one.strength.argmax()) for one in asked]
     turned = [one.is_turn(n) for one, n in zip(asked, best, strict=True)]

@@ -12,6 +12,7 @@ from torch import Tensor
 from torchstickcal.geometry import se3
 from torchstickcal.geometry.cameras import Intrinsics
 from torchstickcal.geometry.singular import solve_information
+from torchstickcal.geometry.vectors import lengths
 from torchstickcal.losses import ReprojectionLoss
 from torchstickcal.losses.robust import GemanMcClure
 from torchstickcal.solvers.elimination.cross_blocks import cross_rows
@@ -84,7 +85,7 @@ def resected(
         return None
     in_camera = rotation @ points + translation[:, None]
     reach = (AGREEING_SIGMAS * sigma_px).clamp_min(LEAST_REACH * float(camera.focal_px.mean()))
-    distance = (camera.project(in_camera.mT[None])[0].mT - pixels).norm(dim=0)
+    distance = lengths(camera.project(in_camera.mT[None])[0].mT - pixels)
     agreeing = (distance < reach) & (in_camera[2] > 0)
     return Resection(rotation, translation, agreeing, moments, float((distance / sigma_px).median()))
 

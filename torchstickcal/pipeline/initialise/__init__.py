@@ -17,6 +17,7 @@ from torch import Tensor
 from torchstickcal.config import InitialiseSettings
 from torchstickcal.errors import RigError
 from torchstickcal.geometry.triangulation import triangulate_robustly
+from torchstickcal.geometry.vectors import lengths
 from torchstickcal.model.measurements import Measurements
 from torchstickcal.model.ranks import nanquantile
 from torchstickcal.model.state import State
@@ -82,8 +83,8 @@ def _of_ends(measurements: Measurements) -> Measurements | None:
 def _change_of_lengths(measurements: Measurements, state: State) -> float:
     """How much the length of a stick changes from frame to frame, as a share of it: the median. 0 without sticks."""
     ends = measurements.by_frame(state.points)[0][:, :, measurements.sticks]
-    lengths = (ends[..., 1] - ends[..., 0]).norm(dim=0).where(measurements.stick_active[0], torch.nan)
-    change = (lengths / lengths.nanmedian(0).values - 1).abs().nanmedian()
+    found = lengths(ends[..., 1] - ends[..., 0]).where(measurements.stick_active[0], torch.nan)
+    change = (found / found.nanmedian(0).values - 1).abs().nanmedian()
     return float(change.nan_to_num(0.0))
 
 

@@ -6,6 +6,7 @@ from collections.abc import Iterator
 
 import torch
 
+from torchstickcal.geometry.vectors import directions
 from torchstickcal.quality.evidence import DOUBTFUL_SHARE, Evidence, median_distances
 from torchstickcal.quality.finding import Finding, Severity
 from torchstickcal.quality.registry import findings
@@ -110,7 +111,7 @@ def _shares(evidence: Evidence) -> Iterator[Finding]:
 
 def _same_views(evidence: Evidence) -> Iterator[Finding]:
     """Pairs of cameras that see the points from the same place, and rigs that have no baseline at all."""
-    rays = torch.nn.functional.normalize(evidence.state.points - evidence.centres[..., None], dim=1)
+    rays = directions(evidence.state.points - evidence.centres[..., None], dim=1)
     angles = median_distances(rays, evidence.measurements.visible[0])
     same = {pair: angle for pair, angle in angles.items() if angle < _SAME_VIEW_RAD}
     for (first, second), angle in same.items():

@@ -7,6 +7,7 @@ from collections.abc import Iterator
 import torch
 from torch import Tensor
 
+from torchstickcal.geometry.vectors import lengths
 from torchstickcal.quality.evidence import Evidence
 from torchstickcal.quality.finding import Finding, Severity
 from torchstickcal.quality.handedness import MIRRORED_SHARE, mirrored_share
@@ -45,8 +46,8 @@ def height_m(points: Tensor, places: dict[str, int]) -> float | None:
         for side in ("left", "right"):
             pair = [places.get(f"{side}_{joint}") for joint in (start, end)]
             if None not in pair:
-                lengths = (points[..., pair[1]] - points[..., pair[0]]).norm(dim=0)
-                found.append(lengths[lengths.isfinite()] / share)
+                segments = lengths(points[..., pair[1]] - points[..., pair[0]])
+                found.append(segments[segments.isfinite()] / share)
     if known := [heights.median() for heights in found if len(heights) >= _LEAST_FRAMES]:
         return float(torch.stack(known).median())
     together = torch.cat(found) if found else points.new_zeros(0)

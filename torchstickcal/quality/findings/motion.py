@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
+from torchstickcal.geometry.vectors import lengths
 from torchstickcal.quality.evidence import Evidence
 from torchstickcal.quality.finding import Finding, Severity
 from torchstickcal.quality.moved import Motion
@@ -65,5 +66,5 @@ def _like_shift_m(evidence: Evidence, found: Motion) -> float:
     mostly about its axis, which no shift is like."""
     turn = evidence.state.rotations[0, found.camera] @ found.tangent[3:]
     across = float(turn[:2].norm())
-    distances = (evidence.points - evidence.centres[found.camera][:, None, None]).norm(dim=0)
+    distances = lengths(evidence.points - evidence.centres[found.camera][:, None, None])
     return across * float(distances.nanmedian()) if across > abs(float(turn[2])) else 0.0

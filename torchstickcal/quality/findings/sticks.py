@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
+from torchstickcal.geometry.vectors import lengths
 from torchstickcal.losses import ReprojectionLoss
 from torchstickcal.model.objective import Objective
 from torchstickcal.pipeline.scale import height_sets_scale
@@ -118,12 +119,12 @@ def _offsets(evidence: Evidence) -> Iterator[Finding]:
             )
             continue
         start, end = evidence.points[..., list(stick.ends)].unbind(-1)
-        lengths = (end - start).norm(dim=0)
-        lengths = lengths[lengths.isfinite()]
-        if len(lengths) < 2:
+        found = lengths(end - start)
+        found = found[found.isfinite()]
+        if len(found) < 2:
             continue
-        offset = stick.between_m - float(lengths.median())
-        variance = (evidence.scale_std * stick.between_m) ** 2 + stick.sigma_m**2 + float(lengths.var()) / len(lengths)
+        offset = stick.between_m - float(found.median())
+        variance = (evidence.scale_std * stick.between_m) ** 2 + stick.sigma_m**2 + float(found.var()) / len(found)
         yield Finding(
             "stick_offset",
             Severity.NOTE,
