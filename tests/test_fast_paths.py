@@ -22,6 +22,8 @@ from torchstickcal.pipeline.check import CameraCheck
 from torchstickcal.pipeline.folds import folds_of_frames, folds_of_points
 from torchstickcal.quality.acceptance import Triangulated
 from torchstickcal.quality.evidence import Evidence
+from torchstickcal.quality.linear import FramePulls, variance_of_sums
+from torchstickcal.quality.moved import _best_changes, _motions, _System
 from torchstickcal.simulate import Noise, SessionSpec
 from torchstickcal.solvers.elimination.normal_equations import NormalEquations
 from torchstickcal.solvers.uncertainty import likelihood
@@ -186,3 +188,40 @@ def test_places_of_keypoints_are_compared_for_all_cameras(evidence: Evidence):
             outside = size is None and bool((low.abs().maximum(high.abs()) > 1.2).any())
             assert found[camera] == (bool((high < 0).all()) or outside)
         assert found[:2] == [False, True]
+
+
+@pytest.mark.parametrize("gradual", [False, True], ids=["knock", "drift"])
+def test_changes_of_all_cameras_are_those_of_each_by_itself(evidence: Evidence, gradual: bool):
+    frames, camera = evidence.measurements.frames, 2
+    share = torch.linspace(-0.5, 0.5, frames) if gradual else (torch.arange(frames) >= 9).double()
+    pulls = FramePulls.of(evidence.measurements, evidence.state, evidence.ended.last.sigma_px)
+    place = slice(6 * camera, 6 * camera + 6)
+    tangent = torch.tensor([0.0, 0, 0, 0.02, -0.01, 0.01]).double()
+    moved = pulls.gradient + share.double()[:, None, None] * (pulls.information[:, :, place] @ tangent).unflatten(1, (-1, 6))
+    system = _System.of(replace(pulls, gradient=moved))
+    motions = _motions(evidence.state.rotations[0], evidence.state.translations[0])
+    changes = _best_changes(system, motions)
+    steps = range(2, frames - 1)
+    shares = torch.stack(
+        [*((torch.arange(frames) >= step).double() for step in steps), torch.linspace(-0.5, 0.5, frames).double()]
+    )
+    for number, change in enumerate(changes):
+        own_place, motion = slice(6 * number, 6 * number + 6), motions[number]
+        for index, weights in enumerate(shares):
+            rows = torch.einsum("k,kij->ij", weights, system.information[:, own_place])
+            own = torch.einsum("k,kij->ij", weights.square(), system.information[:, own_place, own_place])
+            prior = torch.tensor([1 / 0.02**2] * 3 + [1 / 0.03**2] * 3).double().diag()
+            information = motion.mT @ (own - rows @ system.covariance @ rows.mT) @ motion + prior
+            asked = motion.mT @ (weights @ system.pull[:, number])
+            for size, found in ((3, change.asked.of_turn), (6, change.asked.of_any)):
+                expected = asked[:size] @ torch.linalg.solve(information[:size, :size], asked[:size])
+                torch.testing.assert_close(found[index], expected, rtol=1e-6, atol=1e-9)
+        chosen, size = shares[change.chosen], 3 if change.turned else 6
+        best = change.asked.tangent(change.chosen, size)
+        rows, own = system.information[:, own_place], system.information[:, own_place, own_place]
+        others = system.covariance @ torch.einsum("k,kij,i->j", chosen, rows, best)
+        left = system.pull[:, number] - rows @ others + chosen[:, None] * (own @ best)
+        assert change.variance == pytest.approx(max(0.4, float(variance_of_sums(left, own, (12, 24, 48)))), rel=1e-6)
+    most = max(range(len(changes)), key=lambda number: changes[number].strength)
+    assert (most, changes[most].gradual) == (camera, gradual)
+    assert gradual or changes[most].part == 9

@@ -128,10 +128,11 @@ class Gradient(Evaluated):
             self._add_frame_gradient(name, terms)
         for name, terms in objective.linearise_tracks(state).items():
             self._add_track_gradient(name, terms)
-        sums = self._new_sums()
-        for found, own_sums in map_with_idle_workers(lambda columns: self._chunk(columns, dtype), m.chunks()):
+        (first, sums), *others = map_with_idle_workers(lambda columns: self._chunk(columns, dtype), m.chunks())
+        for found in (first, *(found for found, _ in others)):
             for name, slopes in found.items():
                 self._add_images(name, slopes)
+        for _, own_sums in others:
             sums.include(own_sums)
         self._sum_up_images(sums)
 
