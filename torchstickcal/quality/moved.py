@@ -128,6 +128,12 @@ class _Asked(NamedTuple):
     """(n, 6, 6), Cholesky factor of the information about the change"""
     pull: Tensor
     """(n, 6), the pull in its standard deviations: of turns, and of what shifts have beyond turns"""
+    of_turn: Tensor
+    """(n,), squared length of the turn in its standard deviations"""
+    of_any: Tensor
+    """(n,), the same of the whole change"""
+    strength: Tensor
+    """(n,), evidence over the least that a change needs, without regard to lasting errors"""
     motions: Tensor
     """(6, 6), tangents of the turns and shifts"""
 
@@ -139,23 +145,10 @@ class _Asked(NamedTuple):
         each = motions[:, None]
         left = each.mT @ (own - rows @ covariance @ rows.mT) @ each + prior
         root = torch.linalg.cholesky_ex(left).L
-        pulled = torch.linalg.solve_triangular(root, (pull @ motions)[..., None], upper=False)[..., 0]
-        return list(map(_Asked, root, pulled.nan_to_num(), motions))
-
-    @property
-    def of_turn(self) -> Tensor:
-        """(n,), squared length of the turn in its standard deviations."""
-        return self.pull[:, :3].square().sum(-1)
-
-    @property
-    def of_any(self) -> Tensor:
-        """(n,), the same of the whole change."""
-        return self.pull.square().sum(-1)
-
-    @property
-    def strength(self) -> Tensor:
-        """(n,), evidence over the least that a change needs, without regard to lasting errors."""
-        return torch.maximum(self.of_turn / LEAST_EVIDENCE, self.of_any / LEAST_EVIDENCE_OF_ANY)
+        pulled = torch.linalg.solve_triangular(root, (pull @ motions)[..., None], upper=False)[..., 0].nan_to_num()
+        of_turn, of_any = pulled[..., :3].square().sum(-1), pulled.square().sum(-1)
+        strength = torch.maximum(of_turn / LEAST_EVIDENCE, of_any / LEAST_EVIDENCE_OF_ANY)
+        return list(map(_Asked, root, pulled, of_turn, of_any, strength, motions))
 
     def is_turn(self, index: int) -> bool:
         """Whether one of the changes is found as a turn, rather than as a change of any kind."""
