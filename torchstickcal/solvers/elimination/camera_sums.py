@@ -43,7 +43,7 @@ class CameraSums:
         """Add the points (B, 3, n) of a chunk: gradients (B, C, 3, n), Hessians (B, C, 6, n), terms of the unknowns."""
         homogeneous = self.add_gradient(points, gradient, None if unknown is None else unknown.gradient)
         products = torch.cat([homogeneous[:, a : a + 1] * homogeneous[:, a:] for a in range(4)], dim=1)
-        self._hessian_moments.baddbmm_(hessian[:, 1:].flatten(1, 2), products.mT)
+        self._hessian_moments += hessian[:, 1:].flatten(1, 2) @ products.mT
         if unknown is not None:
             self.unknown_hessian += unknown.hessian
             self._unknown_moments += unknown.coupling[:, 1:] @ homogeneous.mT[:, None, None]
@@ -51,7 +51,7 @@ class CameraSums:
     def add_gradient(self, points: Tensor, gradient: Tensor, unknown_gradient: Tensor | None) -> Tensor:
         """Add only what the gradients need: also those of the unknowns, (B, C, k). Returns h, (B, 4, n)."""
         homogeneous = torch.cat([torch.ones_like(points[:, :1]), points], dim=1)
-        self._gradient_moments.baddbmm_(gradient[:, 1:].flatten(1, 2), homogeneous.mT)
+        self._gradient_moments += gradient[:, 1:].flatten(1, 2) @ homogeneous.mT
         if unknown_gradient is not None:
             self.unknown_gradient += unknown_gradient
         return homogeneous
