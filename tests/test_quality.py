@@ -136,6 +136,16 @@ def test_focal_lengths_of_other_proportions_are_said(factor: float, said: bool):
     assert found.count("pixels_not_square") == (3 if said else 0)
 
 
+@pytest.mark.parametrize(("cameras", "code"), [(3, "stick_not_rigid"), (4, "points_noisy")])
+def test_an_end_that_is_a_mark_on_the_floor_is_no_end(cameras: int, code: str):
+    given = session(cameras=cameras, frames=60).observations
+    keypoints, head = given.keypoints.clone(), given.sticks[0].ends[1]
+    keypoints[:, :, head] = keypoints[:, :, head].nanmedian(1, keepdim=True).values
+    quality = calibrate(replace(given, keypoints=keypoints)).quality
+    assert quality.verdict is Verdict.POOR
+    assert code in codes(quality)[:2]
+
+
 @pytest.mark.parametrize("turn_deg", [3.0, 6.0])
 def test_a_camera_that_follows_the_athlete_is_named(turn_deg: float):
     """It turns to one side and back."""

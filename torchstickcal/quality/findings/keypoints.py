@@ -139,14 +139,23 @@ def _noise(evidence: Evidence) -> Iterator[Finding]:
     noisy = (evidence.sigma_px > _USELESS_FOCAL_SHARE * focal).nonzero().flatten().tolist()
     if noisy:
         names = tuple(map(evidence.point, noisy))
+        sticks = evidence.kept.sticks.tolist()
+        without_scale = bool(sticks) and all(set(ends) & set(noisy) for ends in sticks)
+        effect = (
+            "the points not reliable, and so is the scale, which comes from them"
+            if without_scale
+            else "the points not reliable"
+        )
         yield Finding(
             "points_noisy",
-            Severity.CAUTION,
-            f"The keypoints of these points are too noisy, and the points not reliable: {', '.join(names)}.",
+            Severity.SERIOUS if without_scale else Severity.CAUTION,
+            f"The keypoints of these points are too noisy, and {effect}: {', '.join(names)}.",
+            "Look at the videos with the keypoints drawn into them: does the detector follow these points?",
             points=names,
             figure=float(evidence.sigma_px.max()),
             limit=float(_USELESS_FOCAL_SHARE * focal),
             unit="px",
+            is_cause=without_scale,
         )
     if evidence.noise_mrad > _NOISY_MRAD:
         yield Finding(
