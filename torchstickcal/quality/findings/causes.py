@@ -36,7 +36,9 @@ _WHOLE_SHARE = 0.8
 _ALIEN_SHARE = 0.75
 """Share of a camera's keypoints that agree, over that of the others, below which it shows something else."""
 _IN_TIME_SHARE = 0.85
-"""The same at another time, from which on the camera shows the same thing then: others do similar things at other times."""
+_FITTING_SHARE = 0.95
+"""The same at another time, from which on the camera shows the same thing then: others do similar things at other times. And
+where the camera seems to fit as given."""
 _MOVING_SHARE, _MOVING_SPREAD = 0.5, 0.05
 """Share of the keypoints of short parts that agree, each part at its own place, where a camera turns all the time, and how far
 these places are apart at most, as a share of the rig. What shows something else has 0.4 and places that differ by more."""
@@ -62,7 +64,7 @@ def causes(evidence: Evidence) -> Iterator[Finding]:
         return
     agreement = evidence.agreement * (1 - evidence.ended.labels.other_person[0].double().mean(1))
     order = agreement.argsort().tolist()
-    suspicious = (evidence.absurd_focals | evidence.off_centre).tolist()
+    suspicious = (evidence.absurd_focals | evidence.off_centre | evidence.misfits).tolist()
     off_centre = [camera for camera in order if evidence.off_centre[camera]]
     at_end = [camera for camera in order if evidence.set_aside_at_end[camera]]
     doubted = [c for c in order if float(agreement[c]) < _SUSPECT_SHARE or suspicious[c]]
@@ -127,7 +129,8 @@ def _explained(evidence: Evidence, camera: int, rest: Rest, agreement: float) ->
         return cause(hypothesis.code, hypothesis.what, hypothesis.advice, placed.share)
     if finding is not None:
         return finding
-    if as_given > _SOUND_SHARE:
+    misfit = bool(evidence.misfits[camera])
+    if as_given > _SOUND_SHARE and not misfit:
         if as_given < agreement + _CLEAR_GAIN:
             return None
         return cause(
@@ -138,7 +141,8 @@ def _explained(evidence: Evidence, camera: int, rest: Rest, agreement: float) ->
             is_cause=False,
         )
     later, share = shifted_share(rest, sight, evidence.ended.frames[0].rate_hz)
-    if later and share > max(_SOUND_SHARE, _IN_TIME_SHARE * rest.share, as_given + _GAIN):
+    gain, in_time = (_CLEAR_GAIN, _FITTING_SHARE) if misfit else (_GAIN, _IN_TIME_SHARE)
+    if later and share > max(_SOUND_SHARE, in_time * rest.share, as_given + gain):
         word = "later" if later > 0 else "earlier"
         return cause(
             "clock_apart",
@@ -146,9 +150,9 @@ def _explained(evidence: Evidence, camera: int, rest: Rest, agreement: float) ->
             "Estimate the time offsets (refine 'time_offset'), or cut its video to begin with the others.",
             share,
         )
-    if agreement > _ALIEN_SHARE * rest.share:
+    if agreement > _ALIEN_SHARE * rest.share and not misfit:
         return None
-    moving = moving_throughout(rest, sight)
+    moving = None if misfit else moving_throughout(rest, sight)
     if moving is not None and moving.share > _MOVING_SHARE and moving.spread_m < _MOVING_SPREAD * evidence.rig_m:
         return cause(
             "camera_moving",
@@ -159,8 +163,8 @@ def _explained(evidence: Evidence, camera: int, rest: Rest, agreement: float) ->
         )
     return cause(
         "camera_alien",
-        "its keypoints agree with the other cameras at no place, neither mirrored, turned, scaled nor moved in time: it "
-        "shows another person or another recording",
+        "its keypoints fit the other cameras at no place as theirs fit each other, neither mirrored, turned, scaled nor moved "
+        "in time: it shows another person or another recording",
         "Check which person the detector follows in this camera, and whether the video belongs to this session.",
         max([as_given, *(placed.share for _, placed in found)]),
     )
