@@ -14,6 +14,7 @@ from torchstickcal.quality.registry import findings
 from torchstickcal.quality.resection import Resection
 from torchstickcal.quality.trials import (
     Hypothesis,
+    Moving,
     Rest,
     Sight,
     hypotheses,
@@ -129,8 +130,8 @@ def _explained(evidence: Evidence, camera: int, rest: Rest, agreement: float) ->
         return cause(hypothesis.code, hypothesis.what, hypothesis.advice, placed.share)
     if finding is not None:
         return finding
-    misfit = bool(evidence.misfits[camera])
-    if as_given > _SOUND_SHARE and not misfit:
+    misfit, seems_to_fit = bool(evidence.misfits[camera]), as_given > _SOUND_SHARE
+    if seems_to_fit and not misfit:
         if as_given < agreement + _CLEAR_GAIN:
             return None
         return cause(
@@ -141,7 +142,7 @@ def _explained(evidence: Evidence, camera: int, rest: Rest, agreement: float) ->
             is_cause=False,
         )
     later, share = shifted_share(rest, sight, evidence.ended.frames[0].rate_hz)
-    gain, in_time = (_CLEAR_GAIN, _FITTING_SHARE) if misfit else (_GAIN, _IN_TIME_SHARE)
+    gain, in_time = (_CLEAR_GAIN, _FITTING_SHARE) if seems_to_fit else (_GAIN, _IN_TIME_SHARE)
     if later and share > max(_SOUND_SHARE, in_time * rest.share, as_given + gain):
         word = "later" if later > 0 else "earlier"
         return cause(
@@ -152,8 +153,8 @@ def _explained(evidence: Evidence, camera: int, rest: Rest, agreement: float) ->
         )
     if agreement > _ALIEN_SHARE * rest.share and not misfit:
         return None
-    moving = None if misfit else moving_throughout(rest, sight)
-    if moving is not None and moving.share > _MOVING_SHARE and moving.spread_m < _MOVING_SPREAD * evidence.rig_m:
+    moving = None if seems_to_fit else moving_throughout(rest, sight)
+    if moving is not None and _follows(moving, as_given, evidence.rig_m):
         return cause(
             "camera_moving",
             f"it turns all the time, by up to {moving.angle_deg:.2g} degrees, as a camera that follows the athlete: in short "
@@ -185,6 +186,12 @@ def _explains(placed: Resection, plain: Resection | None) -> bool:
     closer = placed.share > plain.share - _ALIKE and placed.distance_sigmas < _CLOSER * plain.distance_sigmas
     gain = _GAIN if plain.share < _SOUND_SHARE else _CLEAR_GAIN
     return closer or placed.share > plain.share + gain
+
+
+def _follows(moving: Moving, as_given: float, rig_m: float) -> bool:
+    """Whether a camera that was placed in short parts of the session turned all the time, and showed the same as the others."""
+    near = moving.angle_deg < _FARTHEST_DEG and moving.spread_m < _MOVING_SPREAD * rig_m
+    return near and moving.share > max(_MOVING_SHARE, as_given + _GAIN)
 
 
 def _closer(places: Sequence[Resection], single: Resection) -> bool:
