@@ -24,22 +24,26 @@ keypoints disagree."""
 
 def judged(evidence: Evidence) -> Quality:
     """The findings on a session, and the acceptance test. Causes are tried only where something is wrong."""
-    return on_worker(evidence.state.points.device, _judged, evidence)
+    return on_worker(evidence.state.points.device, _judged_in_mode, evidence)
+
+
+def _judged_in_mode(evidence: Evidence) -> Quality:
+    with inference_of(evidence.observations, evidence.config, (family.look for family in FAMILIES.values())):
+        return _judged(evidence)
 
 
 def _judged(evidence: Evidence) -> Quality:
-    with inference_of(evidence.observations, evidence.config, (family.look for family in FAMILIES.values())):
-        found = {family: _findings(family, evidence) for family in FAMILIES.values() if not family.tries}
-        large = [finding for family, own in found.items() if not family.small for finding in own]
-        small = [finding for family, own in found.items() if family.small for finding in own]
-        if not evidence.consistent and any(finding.is_cause for finding in large):
-            small = [_as_effect(finding) for finding in small]
-        causes: list[Finding] = []
-        if _worth_trying(evidence, found):
-            causes = [finding for family in FAMILIES.values() if family.tries for finding in _findings(family, evidence)]
-        if any(finding.is_cause for finding in causes):
-            large = list(_as_effects(found))
-        return Quality.of([*causes, *large, *([] if causes else small)], _acceptance(evidence))
+    found = {family: _findings(family, evidence) for family in FAMILIES.values() if not family.tries}
+    large = [finding for family, own in found.items() if not family.small for finding in own]
+    small = [finding for family, own in found.items() if family.small for finding in own]
+    if not evidence.consistent and any(finding.is_cause for finding in large):
+        small = [_as_effect(finding) for finding in small]
+    causes: list[Finding] = []
+    if _worth_trying(evidence, found):
+        causes = [finding for family in FAMILIES.values() if family.tries for finding in _findings(family, evidence)]
+    if any(finding.is_cause for finding in causes):
+        large = list(_as_effects(found))
+    return Quality.of([*causes, *large, *([] if causes else small)], _acceptance(evidence))
 
 
 def _worth_trying(evidence: Evidence, found: dict[Family, list[Finding]]) -> bool:

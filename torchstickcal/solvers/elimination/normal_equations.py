@@ -299,18 +299,16 @@ class NormalEquations(Evaluated):
         """Linearise the camera-point losses of every part and, if the cameras are free, build the reduced camera system."""
         m, zeros = self.objective.measurements, self.state.points.new_zeros
         size = 6 * self._free_cameras + self._unknowns.count
-        reduced, reduced_gradient = zeros(m.sessions, size, size), zeros(m.sessions, size)
+        reduced, reduced_gradient, sums = zeros(m.sessions, size, size), zeros(m.sessions, size), self._new_sums()
         bytes_per_row = 3 * m.sessions * m.num_columns * m.pixels.element_size()
         keeps_rows = size * bytes_per_row <= _MAX_SOLVED_BYTES
         keeps = keeps_rows or (2 * self._free_cameras + self._unknowns.count) * bytes_per_row <= _MAX_CACHED_BYTES
         found = map_with_idle_workers(lambda part: self._part_terms(part, keeps, keeps_rows), self._parts)
-        sums = found[0].sums
         for index, terms in enumerate(found):
             for name, term in terms.images:
                 self._add_images(name, term)
             if self._free_cameras:
-                if index:
-                    sums.include(terms.sums)
+                sums.include(terms.sums)
                 reduced -= terms.rows_squared
                 reduced_gradient -= terms.rows_gradient
             if terms.eliminated is not None:
