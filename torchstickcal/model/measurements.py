@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass, replace
+from typing import overload
 
 import torch
 from torch import Tensor
@@ -24,6 +25,9 @@ from torchstickcal.workers import map_with_idle_workers
 
 _CHUNK_KEYPOINTS = {"cpu": 32_000, "cuda": 1_000_000}
 """Keypoints worked on at a time. What a CPU works on stays in its cache; elsewhere an operation should be worth its launch."""
+
+LONG_KEYPOINTS = 1_000_000
+"""Keypoints from which on a session is long: more than enough for everything that is found of it but its points."""
 
 
 @dataclass(frozen=True)
@@ -140,19 +144,26 @@ class Measurements:
             unknowns=replace(self.unknowns, prior_sigma=self.unknowns.prior_sigma.detach()),
         )
 
-    def within(self, window: slice) -> Measurements:
+    def within(self, window: slice | Tensor) -> Measurements:
         """The measurements of some frames."""
         columns = self.columns_of(window)
         return replace(
             self,
             pixels=self.pixels[..., columns],
             confidence=self.confidence[..., columns],
-            frames=len(range(*window.indices(self.frames))),
+            frames=len(range(*window.indices(self.frames))) if isinstance(window, slice) else len(window),
             motion=self.motion and self.motion.at(columns),
         )
 
-    def columns_of(self, window: slice) -> slice:
-        """The columns of some frames, one after another."""
+    @overload
+    def columns_of(self, window: slice) -> slice: ...
+    @overload
+    def columns_of(self, window: Tensor) -> Tensor: ...
+    def columns_of(self, window: slice | Tensor) -> Columns:
+        """The columns of some frames: those of a slice one after another, or of any by their numbers."""
+        if isinstance(window, Tensor):
+            own = torch.arange(self.points_per_frame, device=self.pixels.device)
+            return (self.points_per_frame * window.to(own)[:, None] + own).flatten()
         start, stop, _ = window.indices(self.frames)
         return slice(start * self.points_per_frame, stop * self.points_per_frame)
 
@@ -241,6 +252,11 @@ class Measurements:
     def points_per_frame(self) -> int:
         """P"""
         return self.num_columns // self.frames
+
+    @property
+    def is_long(self) -> bool:
+        """Whether this is one session of so many keypoints that what there is one of for each of them should not be kept."""
+        return self.sessions == 1 and self.num_cameras * self.num_columns >= LONG_KEYPOINTS
 
     def point_index(self, name: str) -> int:
         """The index of a named point.

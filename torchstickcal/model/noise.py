@@ -61,7 +61,7 @@ def near_keypoints(measurements: Measurements, squared_residuals: Tensor) -> Ten
             break
         views = near.sum(1)
     mask = torch.zeros_like(measurements.by_frame(measurements.visible))
-    mask[:, :, _frames_looked_at(measurements)] = near
+    mask[:, :, frames_looked_at(measurements)] = near
     return mask.flatten(2)
 
 
@@ -123,7 +123,8 @@ def _sums_near(values: Tensor) -> Tensor:
     return sums.view_as(tracks).movedim(2, 1)
 
 
-def _frames_looked_at(measurements: Measurements) -> Tensor:
+def frames_looked_at(measurements: Measurements) -> Tensor:
+    """The frames whose keypoints tell the noise: all, or 2000 of them evenly spaced."""
     return torch.linspace(0, measurements.frames - 1, min(measurements.frames, _MAX_FRAMES)).round().long()
 
 
@@ -131,7 +132,7 @@ def _of_some_frames(measurements: Measurements, columns: Tensor) -> Tensor:
     """A tensor (B, C, N) by frame, (B, C, F', P), of the frames that are looked at; numbers in float64."""
     by_frame = measurements.by_frame(columns)
     if measurements.frames > _MAX_FRAMES:
-        by_frame = by_frame[:, :, _frames_looked_at(measurements)]
+        by_frame = by_frame[:, :, frames_looked_at(measurements)]
     return by_frame.double() if by_frame.is_floating_point() else by_frame
 
 

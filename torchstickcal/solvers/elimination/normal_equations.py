@@ -239,6 +239,22 @@ class NormalEquations(Evaluated):
         finite = rig.isfinite().all(1) & points.flatten(1).isfinite().all(1)
         return cameras, unknowns, points, (failed == 0) & finite
 
+    def solve_points(self, point_rhs: Tensor) -> Tensor:
+        """``H_xx^-1 b`` (B, 3, N), for a right-hand side b (B, 3, N): what the points do while the cameras are held."""
+        points = torch.empty_like(point_rhs)
+
+        def solve(part: Part) -> None:
+            elimination = part.eliminate(raised(self.point_hessian[..., part.columns], self._damping))
+            points[..., part.columns] = elimination.solve(point_rhs[..., part.columns].to(self.point_hessian.dtype)).to(points)
+
+        map_with_idle_workers(solve, self._parts)
+        return points
+
+    def moved(self, state: State, rig_step: Tensor) -> State:
+        """A state after a step (B, 6 C' + K) of the cameras alone."""
+        cameras, unknowns = self._split(rig_step)
+        return state.retracted(cameras, torch.zeros_like(state.points[..., :1]), unknowns)
+
     def point_response(self) -> Tensor:
         """``-H_xx^-1 H_xc``: movement of the points per unit step of the cameras, (B, 6 C' + K, 3, N)."""
         points = self.state.points
