@@ -22,17 +22,12 @@ from torchstickcal.solvers.elimination.normal_equations import NormalEquations
 from torchstickcal.solvers.linearised import Linearised
 
 _MAX_ROUNDS = 20
-_LAST, _REMAINING = 1e-4, 1e-4
-"""Length of a step of the cameras, in their standard deviations, below which it is the last, and what the last step may leave,
-by how much shorter it is than the one before."""
-_FAR_SIGMAS = 1e-2
-"""The same, above which steps that do not become shorter any more say that there is no minimum."""
+_LAST = 1e-2
+"""Length of a step of the cameras, in their standard deviations, below which it is the last."""
 
 
 @torch.no_grad()
-def minimum_with_points_following(
-    objective_at: Callable[[State], Objective], state: State
-) -> tuple[Linearised, Tensor]:
+def minimum_with_points_following(objective_at: Callable[[State], Objective], state: State) -> tuple[Linearised, Tensor]:
     """The state near another that minimises the objective that belongs to it, and that objective there, for one session.
 
     Args:
@@ -48,26 +43,24 @@ def minimum_with_points_following(
     rig_gradient, shortest = system.reduced_gradient, torch.full_like(system.reduced_gradient[:, 0], torch.inf)
     for _ in range(_MAX_ROUNDS):
         plain = -torch.cholesky_solve(rig_gradient[..., None], factor)[..., 0]
-        length = -(plain * rig_gradient).sum(1)
-        length = length.clamp_min(0.0).sqrt()
+        length = (-(plain * rig_gradient).sum(1)).clamp_min(0.0).sqrt()
         if not bool(length < shortest):
             break
-        is_last = bool(length <= _LAST) or (bool(shortest.isfinite()) and bool(length.square() <= _REMAINING * shortest))
         shortest = length
         taken = acceleration.step(plain, -rig_gradient)[0]
         state = _followed(system, Gradient(objective, system.moved(state, taken), True, torch.float64))
         objective = objective_at(state)
-        if is_last:
+        if bool(length <= _LAST):
             break
         slopes = Gradient(objective, state, True, torch.float64)
         rig_gradient = torch.cat([slopes.camera_gradient.flatten(1), slopes.unknown_gradient], dim=1)
         state = _followed(system, slopes)
-    return Linearised(objective, state, cameras_free=True), shortest < _FAR_SIGMAS
+    return Linearised(objective, state, cameras_free=True), shortest <= _LAST
 
 
 def _definite(objective: Objective, state: State) -> NormalEquations:
-    """The system with the exact Hessian or, where that is not positive definite, with its Gauss-Newton approximation."""
-    system = NormalEquations(objective, state, cameras_free=True, exact=True)
+    """The system with the exact Hessian of the images or, where that is not positive definite, with its approximation."""
+    system = NormalEquations(objective, state, cameras_free=True, exact=True, exact_frames=False)
     if bool(torch.linalg.cholesky_ex(system.reduced).info == 0) and bool(system.reduced.isfinite().all()):
         return system
     del system

@@ -147,6 +147,7 @@ class NormalEquations(Evaluated):
         exact: whether to use the exact Hessian instead of the Gauss-Newton approximation. It includes the second derivatives of
             robust kernels, projections and lengths. Track losses must be quadratic. The exact Hessian need not be positive
             definite except at a minimum.
+        exact_frames: whether it then also includes those of lengths. They are negative at many ends of sticks.
     """
 
     point_hessian: Tensor
@@ -163,9 +164,10 @@ class NormalEquations(Evaluated):
         cameras_free: bool,
         damping: float | Tensor = 0.0,
         exact: bool = False,
+        exact_frames: bool = True,
     ) -> None:
         super().__init__(objective, state, cameras_free)
-        m, self._exact = objective.measurements, exact
+        m, self._exact, self._exact_frames = objective.measurements, exact, exact and exact_frames
         self._damping = torch.as_tensor(damping, dtype=torch.float64, device=state.points.device).expand(m.sessions)
         self._parts = parts(m, objective.clusters, self._add_point_losses())
         self._cache: dict[int, _EliminatedPart] = {}
@@ -282,7 +284,7 @@ class NormalEquations(Evaluated):
         """Add the frame losses. Returns the blocks between different points of a frame."""
         m, within = self.objective.measurements, WithinFrame()
         hessian = m.by_frame(self.point_hessian)
-        for name, terms in self.objective.linearise_frames(self.state, self._exact).items():
+        for name, terms in self.objective.linearise_frames(self.state, self._exact_frames).items():
             self._add_frame_gradient(name, terms)
             members = self.objective.groups[name].unbind(1)
             for number, points in enumerate(members):
