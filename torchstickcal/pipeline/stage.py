@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
+from functools import partial
 from typing import NamedTuple
 
 import torch
@@ -21,6 +22,7 @@ from torchstickcal.pipeline.noise import Chosen, NoiseGates, NoiseLevels
 from torchstickcal.pipeline.run import Run
 from torchstickcal.pipeline.scale import outvoted_factors, rulers, scale_factors
 from torchstickcal.solvers import StageRecord, Stop, Termination, solver
+from torchstickcal.solvers.windows import can_be_divided, gauss_newton_by_windows
 
 _RESOLUTION = {torch.float64: 0.0, torch.float32: 1e-7}
 """Relative decrease of the cost that can be distinguished from rounding."""
@@ -132,14 +134,11 @@ def run_stage(
     objective = Objective(measurements, losses)
     least = least if run.config.solver == "gauss_newton" else 0.0
     tolerance = max(stage.cost_tolerance, least, _RESOLUTION[measurements.pixels.dtype])
-    outcome = solver(run.config.solver)(
-        objective,
-        state,
-        cameras_free=stage.cameras == "free",
-        termination=Termination(stage.max_iterations, tolerance, newton_follows=least > 0, leaves_last_step=run.to_rounding),
-        stage=name,
-        listener=run.listener,
-    )
+    termination = Termination(stage.max_iterations, tolerance, newton_follows=least > 0, leaves_last_step=run.to_rounding)
+    solve = partial(solver(run.config.solver), cameras_free=stage.cameras == "free")
+    if run.config.solver == "gauss_newton" and stage.cameras == "held" and can_be_divided(objective):
+        solve = gauss_newton_by_windows
+    outcome = solve(objective, state, termination=termination, stage=name, listener=run.listener)
     state = minimum = outcome.state
     stops = _judged(outcome.stops, Stop.UNDETERMINED, ~_determined(given, measurements))
     if stage.rescale:
