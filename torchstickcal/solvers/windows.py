@@ -19,7 +19,7 @@ from torchstickcal.solvers.elimination.evaluated import Evaluated
 from torchstickcal.solvers.gauss_newton import gauss_newton
 from torchstickcal.workers import map_with_idle_workers
 
-_FRAMES, _MARGIN_FRAMES = 2000, 100
+_FRAMES, _MARGIN_FRAMES = 1000, 64
 """Frames of a window, and frames before and after it that are solved with it and not kept."""
 
 
