@@ -73,13 +73,16 @@ class Measurements:
             kept[list(use)] = True
             visible = visible & kept
         visible = visible & (visible.sum(0) >= 2)
-        keypoints = observations.keypoints.to(dtype)
+        keypoints = observations.keypoints
+        pixels = keypoints.new_empty(len(keypoints), 2, *visible.shape[1:], dtype=dtype)
+        for own, seen, given in zip(pixels, visible, keypoints, strict=True):  # one camera's copy at a time
+            own.copy_(torch.where(seen[..., None], given, 0.0).movedim(-1, 0))
         confidence = visible.to(dtype) if observations.confidence is None else observations.confidence.to(dtype)
         sticks = [s for s in scale_sticks(observations.sticks) if use is None or set(s.ends) <= set(use)]
         cameras = observations.cameras.batched()
         device = keypoints.device
         return Measurements(
-            pixels=torch.where(visible[..., None], keypoints, 0.0).movedim(-1, 1).flatten(2).contiguous()[None],
+            pixels=pixels.flatten(2)[None],
             confidence=torch.where(visible, confidence, 0.0).flatten(1)[None],
             cameras=cameras,
             frames=observations.num_frames,
@@ -170,7 +173,7 @@ class Measurements:
     def keeping(self, kept: Tensor) -> Measurements:
         """The measurements without the keypoints outside a mask (B, C, N), and without points left with a single view."""
         confidence = self.confidence * kept
-        return replace(self, confidence=confidence.mul_((confidence > 0).sum(-2, keepdim=True) >= 2))
+        return replace(self, confidence=confidence.mul_((views_of(confidence > 0) >= 2).unsqueeze(-2)))
 
     def without_sticks(self) -> Measurements:
         """The same keypoints, of which no distance is known."""
@@ -182,7 +185,7 @@ class Measurements:
 
         Infinite where a keypoint is not seen or its point lies behind the camera.
         """
-        cameras = self.cameras_at(state)
+        cameras, chunks = self.cameras_at(state), self.chunks()
 
         def squared(columns: slice) -> Tensor:
             residuals, depth = self._residuals(state, cameras, columns)
@@ -190,14 +193,29 @@ class Measurements:
             distance = residuals.square().sum(-2) * confidence
             return distance.where((confidence > 0) & (depth > 0), torch.inf)
 
-        # Threads may not write into one tensor: the graph of its gradients would not survive that.
-        return torch.cat(map_with_idle_workers(squared, self.chunks()), dim=-1)
+        first = squared(chunks[0])
+        if len(chunks) == 1:
+            return first
+        # Threads may not write into one tensor where that has a graph of gradients, which would not survive it.
+        if first.requires_grad:
+            return torch.cat([first, *map_with_idle_workers(squared, chunks[1:])], dim=-1)
+        found = first.new_empty(self.confidence.shape)
+        found[..., chunks[0]] = first
+
+        def put(columns: slice) -> None:
+            found[..., columns] = squared(columns)
+
+        map_with_idle_workers(put, chunks[1:])
+        return found
 
     def residuals(self, state: State) -> Iterator[tuple[slice, Tensor, Tensor]]:
         """Projections minus keypoints (B, C, 2, n), pixels, and the points' depths (B, C, n), metres, by chunks of columns."""
-        cameras = self.cameras_at(state)
         for columns in self.chunks():
-            yield columns, *self._residuals(state, cameras, columns)
+            yield columns, *self.residuals_at(state, columns)
+
+    def residuals_at(self, state: State, columns: slice) -> tuple[Tensor, Tensor]:
+        """The same of some columns."""
+        return self._residuals(state, self.cameras_at(state), columns)
 
     def _residuals(self, state: State, cameras: Intrinsics, columns: slice) -> tuple[Tensor, Tensor]:
         x, y, z = state.in_cameras(columns, self.pixels.dtype).unbind(-2)
@@ -291,6 +309,18 @@ class Measurements:
     def by_frame(self, columns: Tensor) -> Tensor:
         """A tensor (..., N) as (..., F, P)."""
         return columns.unflatten(-1, (self.frames, -1))
+
+
+def views_of(seen: Tensor) -> Tensor:
+    """How many cameras see each point, (B, N), of a mask (B, C, N). The sum of a mask would first be a copy of it in int64."""
+    return seen.view(torch.uint8).sum(-2, dtype=torch.int16)
+
+
+def count_of(seen: Tensor) -> Tensor:
+    """How many are True in each row of a mask (B, C, N), (B, C); without such a copy where rows are long."""
+    if seen.numel() < LONG_KEYPOINTS:
+        return seen.sum(-1)
+    return torch.stack([row.count_nonzero() for row in seen.flatten(0, 1)]).view(seen.shape[:-1])
 
 
 def _lenses(sessions: Sequence[Intrinsics]) -> Tensor | None:

@@ -26,6 +26,7 @@ _MIN_SIGMA_PX = 1e-4
 _MIN_ACCELERATION_M = 1e-5
 _MIN_VARIANCE_RATIO = 0.05
 """Smallest variance of the true acceleration, as a fraction of the variance that noise gives to the measured acceleration."""
+_COLUMNS_AT_ONCE = 2**20
 _NEAR_FRAMES, _USUAL_FRAMES = 12, 3.0
 """Frames before and after that tell how a point accelerates, less the farther away; all frames together count as this many."""
 
@@ -96,8 +97,15 @@ def estimate_acceleration_m(measurements: Measurements, points: Tensor, point_va
         point_variance: what the noise explains of the variance of each triangulated point, mean over the three axes, (B, N),
             square metres.
     """
-    complete = consecutive(measurements.by_frame(measurements.active), len(SmoothnessLoss.stencil))
-    x, noise = measurements.by_frame(points), measurements.by_frame(point_variance).double()
+    active, x, noise = (measurements.by_frame(tensor) for tensor in (measurements.active, points, point_variance))
+    together = max(1, _COLUMNS_AT_ONCE // (measurements.sessions * measurements.frames))
+    parts = zip(*(tensor.split(together, dim=-1) for tensor in (active, x, noise)), strict=True)
+    return torch.cat([_acceleration_m(*part) for part in parts], dim=-1)
+
+
+def _acceleration_m(active: Tensor, x: Tensor, noise: Tensor) -> Tensor:
+    """That of some of the points: which are active (B, F, P), where they are (B, 3, F, P), and their variance (B, F, P)."""
+    complete, noise = consecutive(active, len(SmoothnessLoss.stencil)), noise.double()
     measured = combined(x, SmoothnessLoss.stencil, dim=-2).square().mean(1)
     expected = noise[:, 2:] + 4 * noise[:, 1:-1] + noise[:, :-2]
     weights = complete / expected.clamp_min(_MIN_ACCELERATION_M**2)

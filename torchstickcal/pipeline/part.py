@@ -29,7 +29,7 @@ _RUN_FRAMES = 100
 """Frames of the part that follow each other, so that motion is seen."""
 _DAMPING = 1e-5
 _FARTHER = 1.1
-"""Reprojection error of a camera where the last stage began, over that where it ended, from which on its start was not near, and
+"""Reprojection error of a camera where the last stage began, over that where it ended, from which on its start was not near:
 some of its decisions may be wrong."""
 
 

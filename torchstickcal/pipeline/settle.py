@@ -36,11 +36,9 @@ def settled(name: str, measurements: Measurements, result: StageResult, run: Run
     """
     began, noise, at = time.perf_counter(), run.noise_of(result.stage), result.minimum
     kept, squared = measurements.keeping(result.inliers), measurements.squared_residuals(at)
-
-    def near() -> Chosen:
-        return Chosen(near_keypoints(measurements, squared), NEAR_SIGMAS)
-
-    _, levels, gates = noise.decided(kept, at, squared, noise.chosen(kept, near))
+    chosen = noise.chosen(kept, lambda: Chosen(near_keypoints(measurements, squared), NEAR_SIGMAS))
+    _, levels, gates = noise.decided(kept, at, squared, chosen)
+    kept = squared = chosen = None  # as large as all keypoints
     held = HeldNoise(noise, gates, result.inliers)
     found, levels, converged = held.minimum_near(measurements, at, run.to_rounding, levels)
     run.took(name, time.perf_counter() - began)

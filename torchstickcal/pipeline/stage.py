@@ -14,7 +14,7 @@ from torchstickcal.config import Stage
 from torchstickcal.errors import CalibrationError
 from torchstickcal.losses import Loss
 from torchstickcal.model.by_motion import found_by_motion
-from torchstickcal.model.measurements import Measurements
+from torchstickcal.model.measurements import Measurements, count_of
 from torchstickcal.model.noise import NEAR_SIGMAS, near_keypoints
 from torchstickcal.model.objective import Objective
 from torchstickcal.model.state import State
@@ -162,12 +162,12 @@ def agreeing_cameras(given: Measurements, kept: Measurements) -> Tensor:
         given: all keypoints.
         kept: those that agree with each other.
     """
-    return kept.visible.sum(2) > _LEAST_AGREEING_SHARE * given.visible.sum(2)
+    return count_of(kept.visible) > _LEAST_AGREEING_SHARE * count_of(given.visible)
 
 
 def _determined(given: Measurements, kept: Measurements) -> Tensor:
     """Whether the keypoints that agree determine a session's cameras and points, (B,); arguments as above."""
-    measured = 2 * kept.visible.sum((1, 2)) + kept.stick_active.sum((1, 2))
+    measured = 2 * count_of(kept.visible).sum(1) + kept.stick_active.sum((1, 2))
     unknown = 3 * kept.active.sum(1) + 6 * (kept.num_cameras - 1) + kept.unknowns.count
     return (measured > unknown) & agreeing_cameras(given, kept).all(1)
 

@@ -12,6 +12,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
+from torchstickcal.model.measurements import count_of
 from torchstickcal.model.objective import Objective
 from torchstickcal.model.state import State
 from torchstickcal.solvers.base import IterationRecord, Listener, Outcome, Stop, Termination
@@ -47,7 +48,7 @@ def gauss_newton(
     """
     _raise_allocator_threshold()
     device = state.points.device
-    keypoints = objective.measurements.visible.sum((1, 2)).tolist()
+    keypoints = count_of(objective.measurements.visible).sum(1).tolist()
     sessions = [_SessionControl(termination, _EXACT_COST_PER_KEYPOINT * count) for count in keypoints]
     records: list[list[IterationRecord]] = [[] for _ in sessions]
     best = trial = state

@@ -11,7 +11,7 @@ from dataclasses import replace
 
 import torch
 
-from torchstickcal.losses import TrackLoss
+from torchstickcal.losses.camera_point import CameraPointSlopes
 from torchstickcal.model.objective import Objective
 from torchstickcal.model.state import State
 from torchstickcal.solvers.base import Listener, Outcome, Stop, Termination, ignore_record
@@ -76,7 +76,7 @@ class _Value(Evaluated):
         m = objective.measurements
         for name, terms in objective.linearise_frames(state).items():
             self.terms[name] = self.terms[name] + terms.cost
-        for slopes in map_with_idle_workers(lambda columns: objective.slopes_of_chunk(state, columns), m.chunks()):
+        for slopes in map_with_idle_workers(self._of_images, m.chunks()):
             for name, found in slopes.items():
                 self._add_images(name, found)
         reach = max((len(loss.stencil) - 1 for loss in objective.track_losses.values()), default=0)
@@ -86,3 +86,7 @@ class _Value(Evaluated):
             for name, terms in objective.within(with_next).linearise_tracks(own).items():
                 self.terms[name] = self.terms[name] + terms.cost
         self.reprojection_px = (self._squares / self._weights.clamp_min(1e-300)).sqrt()
+
+    def _of_images(self, columns: slice) -> dict[str, CameraPointSlopes]:
+        found = self.objective.slopes_of_chunk(self.state, columns)
+        return {name: slopes._replace(gradient=self.state.points[..., :0]) for name, slopes in found.items()}
