@@ -172,8 +172,8 @@ class Measurements:
 
     def keeping(self, kept: Tensor) -> Measurements:
         """The measurements without the keypoints outside a mask (B, C, N), and without points left with a single view."""
-        confidence = self.confidence * kept
-        return replace(self, confidence=confidence.mul_((views_of(confidence > 0) >= 2).unsqueeze(-2)))
+        kept = kept & self.visible
+        return replace(self, confidence=self.confidence.where(kept & (views_of(kept) >= 2).unsqueeze(-2), 0.0))
 
     def without_sticks(self) -> Measurements:
         """The same keypoints, of which no distance is known."""
@@ -274,7 +274,7 @@ class Measurements:
     @property
     def is_long(self) -> bool:
         """Whether this is one session of so many keypoints that what there is one of for each of them should not be kept."""
-        return self.sessions == 1 and self.num_cameras * self.num_columns >= LONG_KEYPOINTS
+        return self.sessions == 1 and are_many(self.num_cameras * self.num_columns)
 
     def point_index(self, name: str) -> int:
         """The index of a named point.
@@ -311,6 +311,11 @@ class Measurements:
         return columns.unflatten(-1, (self.frames, -1))
 
 
+def are_many(keypoints: int) -> bool:
+    """Whether so many keypoints make a session long."""
+    return keypoints >= LONG_KEYPOINTS
+
+
 def views_of(seen: Tensor) -> Tensor:
     """How many cameras see each point, (B, N), of a mask (B, C, N). The sum of a mask would first be a copy of it in int64."""
     return seen.view(torch.uint8).sum(-2, dtype=torch.int16)
@@ -318,7 +323,7 @@ def views_of(seen: Tensor) -> Tensor:
 
 def count_of(seen: Tensor) -> Tensor:
     """How many are True in each row of a mask (B, C, N), (B, C); without such a copy where rows are long."""
-    if seen.numel() < LONG_KEYPOINTS:
+    if not are_many(seen.numel()):
         return seen.sum(-1)
     return torch.stack([row.count_nonzero() for row in seen.flatten(0, 1)]).view(seen.shape[:-1])
 

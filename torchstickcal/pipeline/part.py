@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from torchstickcal.errors import ObservationError, RigError
-from torchstickcal.model.measurements import LONG_KEYPOINTS
+from torchstickcal.model.measurements import are_many
 from torchstickcal.model.objective import Objective
 from torchstickcal.model.trajectories import WINDOW_FRAMES
 from torchstickcal.model.unknowns import clock_refinements
@@ -48,7 +48,7 @@ def adjusted_from_part(models: ModelSelection, observations: Observations, run: 
     """
     if len(run.camera_stages) < 2 or models.allowed & clock_refinements() or not observations.intrinsics_known:
         return None
-    if observations.timestamps is not None or observations.readout_s or observations.keypoints[..., 0].numel() < LONG_KEYPOINTS:
+    if observations.timestamps is not None or observations.readout_s or not are_many(observations.visible.numel()):
         return None
     try:
         of_part = ModelSelection(part_of(observations), run, start)

@@ -118,7 +118,7 @@ class ModelSelection:
         The latter only if it fits better, which it does not where the videos are mirrored.
         """
         m, names = found.measurements, found.observations[0].point_names
-        points = m.by_frame(found.state.points[0].where(found.kept.active[0], torch.nan))
+        points = m.by_frame(found.state.points[0].where(found.last.inliers[0].any(0), torch.nan))
         if mirrored_share(points, names) <= MIRRORED_SHARE:
             return found
         reverse = replace(found[0], state=found.state.depth_reversed(m.active))
