@@ -12,7 +12,7 @@ import torchstickcal
 
 ROOT = Path(__file__).parents[1]
 FLOORS = [
-    ["errors", "workers", "processes", "lazy", "precision", "samples", "dual"],
+    ["errors", "workers", "processes", "lazy", "precision", "samples", "dual", "allocator"],
     ["files", "shapes", "arrays", "archives"],
     ["untrusted"],
     ["registry", "skeletons"],

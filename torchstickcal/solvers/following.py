@@ -21,7 +21,8 @@ from torchstickcal.solvers.elimination.evaluated import Gradient
 from torchstickcal.solvers.elimination.normal_equations import NormalEquations
 from torchstickcal.solvers.linearised import Linearised
 
-_MAX_ROUNDS = 20
+_MAX_ROUNDS, _MUCH_LONGER = 10, 3.0
+"""Number of steps at most, and length of a step over the shortest one, from which on they lead away."""
 _LAST = 1e-2
 """Length of a step of the cameras, in their standard deviations, below which it is the last."""
 
@@ -40,13 +41,14 @@ def minimum_with_points_following(objective_at: Callable[[State], Objective], st
     objective = objective_at(state)
     system = _definite(objective, state)
     factor, acceleration = torch.linalg.cholesky_ex(system.reduced).L, Acceleration()
-    rig_gradient, shortest = system.reduced_gradient, torch.full_like(system.reduced_gradient[:, 0], torch.inf)
+    rig_gradient = system.reduced_gradient
+    length = shortest = torch.full_like(rig_gradient[:, 0], torch.inf)
     for _ in range(_MAX_ROUNDS):
         plain = -torch.cholesky_solve(rig_gradient[..., None], factor)[..., 0]
         length = (-(plain * rig_gradient).sum(1)).clamp_min(0.0).sqrt()
-        if not bool(length < shortest):
+        if not bool(length < _MUCH_LONGER * shortest):
             break
-        shortest = length
+        shortest = torch.minimum(length, shortest)
         taken = acceleration.step(plain, -rig_gradient)[0]
         state = _followed(system, Gradient(objective, system.moved(state, taken), True, torch.float64))
         objective = objective_at(state)
@@ -55,7 +57,8 @@ def minimum_with_points_following(objective_at: Callable[[State], Objective], st
         slopes = Gradient(objective, state, True, torch.float64)
         rig_gradient = torch.cat([slopes.camera_gradient.flatten(1), slopes.unknown_gradient], dim=1)
         state = _followed(system, slopes)
-    return Linearised(objective, state, cameras_free=True), shortest <= _LAST
+        del slopes
+    return Linearised(objective, state, cameras_free=True), length <= _LAST
 
 
 def _definite(objective: Objective, state: State) -> NormalEquations:
