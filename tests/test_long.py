@@ -8,7 +8,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from torchstickcal import Calibration, Observations, calibrate
+from torchstickcal import Calibration, Observations, calibrate, triangulate
 from torchstickcal.losses import Cauchy, GemanMcClure, ReprojectionLoss, SmoothnessLoss, StickLengthLoss
 from torchstickcal.model.measurements import Measurements, count_of, views_of
 from torchstickcal.model.noise import NEAR_SIGMAS, near_keypoints
@@ -77,6 +77,23 @@ def test_a_long_session_ends_where_a_short_one_ends(kind: str, request: pytest.F
     found = calibrate(observations)
     assert [stage.name for stage in found.stages].count("refined") > [stage.name for stage in plain.stages].count("refined")
     assert_alike(found, plain)
+
+
+def test_single_precision_too(request: pytest.FixtureRequest):
+    observations, config = session("outliers"), {"extends": "default", "precision": "float32"}
+    plain = calibrate(observations, config)
+    request.getfixturevalue("long")
+    assert_alike(calibrate(observations, config), plain)
+
+
+def test_triangulation_too(request: pytest.FixtureRequest):
+    observations = session("outliers")
+    calibration = calibrate(observations)
+    plain = triangulate(observations, calibration)
+    request.getfixturevalue("long")
+    found = triangulate(observations, calibration)
+    assert float((found.inliers != plain.inliers).double().mean()) < 1e-3
+    assert float((found.points - plain.points).abs().nanmedian()) < 1e-6
 
 
 def test_lenses_too(request: pytest.FixtureRequest):

@@ -139,7 +139,8 @@ def run_stage(
     tolerance = max(stage.cost_tolerance, least, _RESOLUTION[measurements.pixels.dtype])
     termination = Termination(stage.max_iterations, tolerance, newton_follows=least > 0, leaves_last_step=run.to_rounding)
     solve = partial(solver(run.config.solver), cameras_free=stage.cameras == "free")
-    if run.config.solver == "gauss_newton" and stage.cameras == "held" and can_be_divided(objective):
+    plain = run.config.solver == "gauss_newton" and not run.to_rounding
+    if plain and stage.cameras == "held" and can_be_divided(objective):
         solve = gauss_newton_by_windows
     outcome = solve(objective, state, termination=termination, stage=name, listener=run.listener)
     state = minimum = outcome.state

@@ -24,8 +24,13 @@ _FRAMES, _MARGIN_FRAMES = 1000, 64
 
 
 def can_be_divided(objective: Objective) -> bool:
-    """Whether a session is long, and all that couples its frames has an estimated strength, one for each of them."""
-    return objective.measurements.is_long and all(loss.sigma.ndim >= 3 for loss in objective.track_losses.values())
+    """Whether a session is long, and all that couples its frames has an estimated strength, one for each of them.
+
+    On a graphics card windows would be too small to be worth its launches.
+    """
+    m = objective.measurements
+    on_cpu = m.pixels.device.type == "cpu"
+    return m.is_long and on_cpu and all(loss.sigma.ndim >= 3 for loss in objective.track_losses.values())
 
 
 def gauss_newton_by_windows(
