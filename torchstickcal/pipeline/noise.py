@@ -139,19 +139,19 @@ class StageNoise:
         return near() if rejects is None else Chosen(kept.visible, rejects)
 
     def decided(
-        self, kept: Measurements, state: State, squared_residuals: Tensor, chosen: Chosen, times: Tensor | None = None
+        self, kept: Measurements, state: State, sigma_px: Tensor, chosen: Chosen, times: Tensor | None = None
     ) -> tuple[dict[str, Loss], NoiseLevels, NoiseGates]:
         """The stage's losses at a state, their noise, and what was decided about it.
 
         Args:
             kept: the keypoints that take part in the stage.
             state: where the errors are looked at.
-            squared_residuals: of all keypoints at the state.
-            chosen: the keypoints from which their noise is estimated.
+            sigma_px: the standard deviation of the keypoints there, (B, P), pixels.
+            chosen: the keypoints from which it was estimated.
             times: (B, P), as many keypoints of each point as count as one where the stage estimates that; NaN where it is to be
                 estimated, None for all.
         """
-        found = _Levels(kept, state, chosen.sigma_px(kept, squared_residuals), times=times)
+        found = _Levels(kept, state, sigma_px, times=times)
         losses = self._losses(kept, found.sigma_px, found.correlation_frames, found.acceleration_m)
         return losses, found.levels, NoiseGates(chosen, found.gates)
 

@@ -48,12 +48,13 @@ def settled(name: str, measurements: Measurements, result: StageResult, run: Run
 
 def _decided(noise: StageNoise, measurements: Measurements, inliers: Tensor, at: State) -> tuple[NoiseLevels, NoiseGates]:
     """The noise at a state, and what is decided about it, by the keypoints that take part."""
-    kept, squared = measurements.keeping(inliers), measurements.squared_residuals(at)
 
     def near() -> Chosen:
-        return Chosen(near_keypoints(measurements, squared), NEAR_SIGMAS)
+        return Chosen(near_keypoints(measurements, measurements.squared_residuals(at)), NEAR_SIGMAS)
 
-    _, levels, gates = noise.decided(kept, at, squared, noise.chosen(kept, near))
+    kept = measurements.keeping(inliers)
+    chosen = noise.chosen(kept, near)
+    _, levels, gates = noise.decided(kept, at, chosen.sigma_px_at(measurements, at), chosen)
     return levels, gates
 
 

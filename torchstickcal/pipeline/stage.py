@@ -130,8 +130,9 @@ def run_stage(
             state, squared_residuals = found, measurements.squared_residuals(found)
     noise = run.noise_of(stage)
     chosen = near if stage.cameras == "free" else noise.chosen(measurements, lambda: near)
-    losses, levels, gates = noise.decided(measurements, state, squared_residuals, chosen, times)
+    sigma_px = chosen.sigma_px(measurements, squared_residuals)
     del squared_residuals
+    losses, levels, gates = noise.decided(measurements, state, sigma_px, chosen, times)
     if measurements.is_long:
         give_back_freed_memory()
     objective = Objective(measurements, losses)

@@ -42,6 +42,7 @@ def minimum_with_points_following(objective_at: Callable[[State], Objective], st
     system = _definite(objective, state)
     factor, acceleration = torch.linalg.cholesky_ex(system.reduced).L, Acceleration()
     rig_gradient = system.reduced_gradient
+    del system.point_gradient  # as large as all points
     length = shortest = torch.full_like(rig_gradient[:, 0], torch.inf)
     for _ in range(_MAX_ROUNDS):
         plain = -torch.cholesky_solve(rig_gradient[..., None], factor)[..., 0]
