@@ -62,7 +62,7 @@ def assert_alike(found: Calibration, plain: Calibration) -> None:
     std = plain.covariance.diagonal().sqrt().view(-1, 6)[:, :3]
     assert found.status == plain.status == "converged"
     assert float(((found.translations - plain.translations)[1:].abs() / std).max()) < 0.2
-    assert float((found.inliers != plain.inliers).double().mean()) < 1e-3
+    assert float((found.inliers != plain.inliers).double().mean()) < 2e-3
     assert torch.equal(found.keypoint_index, plain.keypoint_index)
     assert float((found.points - plain.points).abs().nanmedian()) < 1e-4
     assert torch.allclose(found.covariance.diagonal(), plain.covariance.diagonal(), rtol=0.05)
@@ -84,6 +84,15 @@ def test_single_precision_too(request: pytest.FixtureRequest):
     plain = calibrate(observations, config)
     request.getfixturevalue("long")
     assert_alike(calibrate(observations, config), plain)
+
+
+def test_a_scale_that_no_loss_determines(request: pytest.FixtureRequest):
+    observations = session("plain")
+    plain = calibrate(observations, "human_only")
+    request.getfixturevalue("long")
+    found = calibrate(observations, "human_only")
+    assert found.status == "converged"
+    assert torch.allclose(found.translations, plain.translations, atol=0.003)
 
 
 def test_triangulation_too(request: pytest.FixtureRequest):

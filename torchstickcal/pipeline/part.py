@@ -1,7 +1,7 @@
 """A long session begins with a part of its frames: some thousand frames tell nearly as well as an hour where the cameras are.
 
-The part goes through all stages. From its cameras, the points of all frames are found, and the last stage that estimates
-cameras is run with everything: it decides of every keypoint whether it takes part, and ends at the same minimum.
+The part goes through all stages. From its cameras, the points of all frames are found, and the last two stages that estimate
+cameras are run with everything: they decide of every keypoint whether it takes part, and end at the same minimum.
 """
 
 from __future__ import annotations
@@ -13,7 +13,6 @@ from torch import Tensor
 
 from torchstickcal.errors import ObservationError, RigError
 from torchstickcal.model.measurements import are_many
-from torchstickcal.model.objective import Objective
 from torchstickcal.model.trajectories import WINDOW_FRAMES
 from torchstickcal.model.unknowns import clock_refinements
 from torchstickcal.observations import Observations
@@ -21,16 +20,17 @@ from torchstickcal.pipeline.adjust import adjust_cameras, begin
 from torchstickcal.pipeline.adjustment import Adjustment, WarmStart
 from torchstickcal.pipeline.run import Run
 from torchstickcal.pipeline.selection import ModelSelection
+from torchstickcal.pipeline.stages import through
 from torchstickcal.pipeline.start import Poses
-from torchstickcal.solvers.elimination.normal_equations import NormalEquations
 
 _PART_KEYPOINTS = 200_000
 _RUN_FRAMES = 100
 """Frames of the part that follow each other, so that motion is seen."""
-_DAMPING = 1e-5
+_ROUGHLY = 1e-3
+"""Relative decrease of the cost from which on the stage before the last is near enough to its end."""
 _FARTHER = 1.1
-"""Reprojection error of a camera where the last stage began, over that where it ended, from which on its start was not near:
-some of its decisions may be wrong."""
+"""Reprojection error of a camera where that stage began, over that where it ended, from which on its start was not near. Some
+of its decisions may be wrong then."""
 
 
 def adjusted_from_part(models: ModelSelection, observations: Observations, run: Run, start: Poses | None) -> Adjustment | None:
@@ -60,9 +60,12 @@ def adjusted_from_part(models: ModelSelection, observations: Observations, run: 
     sigma_px = part.last.sigma_px[0]
     cameras = part.state.rotations[0], part.state.translations[0]
     found = WarmStart(*cameras, points=None, unknowns=part.state.unknowns[0], inliers=None, sigma_px=sigma_px)
-    begun = _nearer(begin(observations, run, part.refined, start=found), part)
-    whole = adjust_cameras(begun, run, only_last=True)
-    return replace(whole, records=(part.records[0] + whole.records[0],)) if _began_near(whole) else None
+    *_, before_last, _ = run.camera_stages.items()
+    whole = through([before_last], begin(observations, run, part.refined, start=found), run, _ROUGHLY)
+    if not _began_near(whole):
+        return None
+    whole = adjust_cameras(whole, run, only_last=True)
+    return replace(whole, records=(part.records[0] + whole.records[0],))
 
 
 def part_of(observations: Observations) -> Observations:
@@ -90,19 +93,8 @@ def part_of(observations: Observations) -> Observations:
     )
 
 
-def _nearer(begun: Adjustment, part: Adjustment) -> Adjustment:
-    """With cameras and points nearer to the minimum of the losses of the part: after one Gauss-Newton step.
-
-    Errors of the start that are the same in every frame would otherwise be taken for errors of the keypoints that last.
-    """
-    objective = Objective(begun.measurements, part.last.losses)
-    step = NormalEquations(objective, begun.state, cameras_free=True, damping=_DAMPING).step()
-    state = begun.state.retracted(step.cameras, step.points, step.unknowns)
-    return replace(begun, state=state) if bool(step.solved.all()) else begun
-
-
 def _began_near(adjustment: Adjustment) -> bool:
     """Whether the last stage began near where it ended, by the reprojection errors of all cameras."""
-    iterations = adjustment.records[0][-1].iterations
+    iterations = adjustment.last.records[0].iterations
     both = iterations[0].reprojection_px, iterations[-1].reprojection_px
     return all(before <= _FARTHER * after for before, after in zip(*both, strict=True))

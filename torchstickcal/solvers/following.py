@@ -23,6 +23,8 @@ from torchstickcal.solvers.linearised import Linearised
 
 _MAX_ROUNDS, _MUCH_LONGER = 10, 3.0
 """Number of steps at most, and length of a step over the shortest one, from which on they lead away."""
+_DAMPING = 1e-7
+"""So little that it matters only where nothing determines the scale."""
 _LAST = 1e-2
 """Length of a step of the cameras, in their standard deviations, below which it is the last."""
 
@@ -64,11 +66,11 @@ def minimum_with_points_following(objective_at: Callable[[State], Objective], st
 
 def _definite(objective: Objective, state: State) -> NormalEquations:
     """The system with the exact Hessian of the images or, where that is not positive definite, with its approximation."""
-    system = NormalEquations(objective, state, cameras_free=True, exact=True, exact_frames=False)
+    system = NormalEquations(objective, state, True, _DAMPING, exact=True, exact_frames=False)
     if bool(torch.linalg.cholesky_ex(system.reduced).info == 0) and bool(system.reduced.isfinite().all()):
         return system
     del system
-    return NormalEquations(objective, state, cameras_free=True)
+    return NormalEquations(objective, state, True, _DAMPING)
 
 
 def _followed(system: NormalEquations, slopes: Gradient) -> State:
