@@ -18,6 +18,7 @@ from torchstickcal.quality.trials import (
     Sight,
     hypotheses,
     moved_within,
+    moving_throughout,
     shifted_share,
     sight_of,
     tried,
@@ -36,6 +37,9 @@ _ALIEN_SHARE = 0.75
 """Share of a camera's keypoints that agree, over that of the others, below which it shows something else."""
 _IN_TIME_SHARE = 0.85
 """The same at another time, from which on the camera shows the same thing then: others do similar things at other times."""
+_MOVING_SHARE, _MOVING_SPREAD = 0.5, 0.05
+"""Share of the keypoints of short parts that agree, each part at its own place, where a camera turns all the time, and how far
+these places are apart at most, as a share of the rig. What shows something else has 0.4 and places that differ by more."""
 _FARTHEST_DEG, _FARTHEST_SHARE = 45.0, 0.3
 """Largest change of a camera that is a motion of it, the shift as a share of the rig; beyond, it shows something else."""
 _MOST_SUSPECTS = 4
@@ -144,6 +148,15 @@ def _explained(evidence: Evidence, camera: int, rest: Rest, agreement: float) ->
         )
     if agreement > _ALIEN_SHARE * rest.share:
         return None
+    moving = moving_throughout(rest, sight)
+    if moving is not None and moving.share > _MOVING_SHARE and moving.spread_m < _MOVING_SPREAD * evidence.rig_m:
+        return cause(
+            "camera_moving",
+            f"it turns all the time, by up to {moving.angle_deg:.2g} degrees, as a camera that follows the athlete: in short "
+            "parts of the session, its keypoints agree at a place of their own",
+            "Use a camera that stands still, or leave it out.",
+            moving.share,
+        )
     return cause(
         "camera_alien",
         "its keypoints agree with the other cameras at no place, neither mirrored, turned, scaled nor moved in time: it "
