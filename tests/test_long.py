@@ -34,6 +34,7 @@ def long(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("torchstickcal.model.measurements.LONG_KEYPOINTS", 1000)
     monkeypatch.setattr("torchstickcal.pipeline.part._PART_KEYPOINTS", 6000)
     monkeypatch.setattr("torchstickcal.pipeline.part._RUN_FRAMES", 40)
+    monkeypatch.setattr("torchstickcal.pipeline.part._LEAST_TIMES_LONGER", 1)
     monkeypatch.setattr("torchstickcal.solvers.windows._FRAMES", 70)
     monkeypatch.setattr("torchstickcal.solvers.windows._MARGIN_FRAMES", 40)
 

@@ -26,6 +26,8 @@ from torchstickcal.pipeline.start import Poses
 _PART_KEYPOINTS = 200_000
 _RUN_FRAMES = 100
 """Frames of the part that follow each other, so that motion is seen."""
+_LEAST_TIMES_LONGER = 2
+"""So many times as many frames a session must have as the part, for the part to be worth its time."""
 _ROUGHLY = 1e-3
 """Relative decrease of the cost from which on the stage before the last is near enough to its end."""
 _FARTHER = 1.1
@@ -50,8 +52,11 @@ def adjusted_from_part(models: ModelSelection, observations: Observations, run: 
         return None
     if observations.timestamps is not None or observations.readout_s or not are_many(observations.visible.numel()):
         return None
+    few = part_of(observations)
+    if _LEAST_TIMES_LONGER * few.num_frames > observations.num_frames:
+        return None
     try:
-        of_part = ModelSelection(part_of(observations), run, start)
+        of_part = ModelSelection(few, run, start)
         part, _ = of_part.adjusted(None)
     except (RigError, ObservationError):
         return None
@@ -76,8 +81,9 @@ def part_of(observations: Observations) -> Observations:
     seen = (observations.visible.sum(0) >= 2).sum(1).cumsum(0)
     count = -(-_PART_KEYPOINTS // (observations.num_cameras * observations.num_points * _RUN_FRAMES))
     middles = torch.searchsorted(seen, (torch.arange(count, device=seen.device) + 0.5) / count * seen[-1])
-    starts = (middles - _RUN_FRAMES // 2).clamp(0, observations.num_frames - _RUN_FRAMES)
-    frames = (starts[:, None] + torch.arange(_RUN_FRAMES, device=seen.device)).flatten().unique()
+    length = min(_RUN_FRAMES, observations.num_frames)
+    starts = (middles - length // 2).clamp(0, observations.num_frames - length)
+    frames = (starts[:, None] + torch.arange(length, device=seen.device)).flatten().unique()
     runs = frames.tensor_split((frames.diff() > 1).nonzero()[:, 0].cpu() + 1)
     unseen = frames.new_full((WINDOW_FRAMES + 1,), -1)
     frames = torch.cat([part for run in runs for part in (run, unseen)])
