@@ -28,7 +28,7 @@ _RUN_FRAMES = 100
 """Frames of the part that follow each other, so that motion is seen."""
 _LEAST_TIMES_LONGER = 2
 """So many times as many frames a session must have as the part, for the part to be worth its time."""
-_ROUGHLY = 1e-3
+_ROUGHLY = 1e-2
 """Relative decrease of the cost from which on the stage before the last is near enough to its end."""
 _FARTHER = 1.1
 """Reprojection error of a camera where that stage began, over that where it ended, from which on its start was not near. Some
