@@ -146,6 +146,25 @@ def test_an_end_that_is_a_mark_on_the_floor_is_no_end(cameras: int, code: str):
     assert code in codes(quality)[:2]
 
 
+@pytest.mark.parametrize(
+    ("frames_alike", "worse", "error_px", "alien"),
+    [(12, [4], 7.0, True), (12, [0], 7.0, True), (1, [4], 3.5, False), (12, [0, 1, 2, 3, 4], 7.0, False)],
+)
+def test_a_camera_that_fits_worse_for_long_shows_something_else(
+    frames_alike: int, worse: list[int], error_px: float, alien: bool
+):
+    """Not where its errors change from frame to frame, nor where those of all cameras last."""
+    given = session(frames=80)
+    draws = torch.randn(5, 80 // frames_alike + 2, 21, 2, generator=torch.Generator().manual_seed(3), dtype=torch.float64)
+    slow = torch.nn.functional.interpolate(draws.flatten(2).mT, scale_factor=frames_alike, mode="linear").mT[:, :80]
+    errors = torch.zeros(5, 80, 21, 2).double()
+    errors[worse] = error_px * slow.unflatten(2, (21, 2))[worse]
+    calibration = calibrate(replace(given.observations, keypoints=given.observations.keypoints + errors))
+    evidence = evidence_of(calibration)
+    assert evidence.misfits.tolist() == [alien and camera in worse for camera in range(5)]
+    assert ("camera_alien" in codes(calibration.quality)) == alien
+
+
 @pytest.mark.parametrize("turn_deg", [3.0, 6.0])
 def test_a_camera_that_follows_the_athlete_is_named(turn_deg: float):
     """It turns to one side and back."""

@@ -42,7 +42,7 @@ def _judged(evidence: Evidence) -> Quality:
 
 def _worth_trying(evidence: Evidence, found: dict[Family, list[Finding]]) -> bool:
     """Whether something is wrong, or may be, that no finding explains."""
-    if bool((evidence.off_centre | evidence.set_aside_at_end).any()):
+    if bool((evidence.off_centre | evidence.set_aside_at_end | evidence.misfits).any()):
         return True
     every = [finding for own in found.values() for finding in own]
     wrong = any(finding.severity >= Severity.SERIOUS or finding.code == "camera_doubtful" for finding in every)
