@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC
-from typing import ClassVar, NamedTuple
+from typing import ClassVar, NamedTuple, Self
 
 import torch
 from torch import Tensor
@@ -43,6 +43,14 @@ class TrackLoss(Loss, ABC):
                 got=cls.stencil,
                 expected="2 or 3 factors",
             )
+
+    def within(self, window: slice, frames: int) -> Self:
+        """The loss of some frames, of so many, where ``sigma`` is one for each of its residuals, (B, F - reach, P)."""
+        reach = len(self.stencil) - 1
+        if self.sigma.ndim < 3 or self.sigma.shape[-2] != frames - reach:
+            return self
+        start, stop, _ = window.indices(frames)
+        return self._with(sigma=self.sigma[..., start : max(start, stop - reach), :])
 
     @in_full_precision
     def forward(self, points: Tensor) -> Tensor:

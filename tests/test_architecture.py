@@ -12,7 +12,7 @@ import torchstickcal
 
 ROOT = Path(__file__).parents[1]
 FLOORS = [
-    ["errors", "workers", "processes", "inference", "lazy", "precision", "samples", "dual"],
+    ["errors", "workers", "processes", "inference", "lazy", "precision", "samples", "dual", "allocator"],
     ["files", "shapes", "arrays", "archives"],
     ["untrusted"],
     ["registry", "skeletons"],

@@ -59,13 +59,20 @@ def map_with_idle_workers(function: Callable[[_Item], _Result], items: Sequence[
         for number in open_items:
             results[number] = function(items[number])
 
-    helpers = [_pool.submit(_with_modes(work)) for _ in range(min(_pool._max_workers, len(items)) - 1)]
+    open_work = [work]  # a cancelled helper stays in the queue until a worker is idle: it must not keep the work alive
+
+    def help_out() -> None:
+        for own in open_work:
+            own()
+
+    helpers = [_pool.submit(_with_modes(help_out)) for _ in range(min(_pool._max_workers, len(items)) - 1)]
     try:
         work()
     finally:
         for helper in helpers:
             if not helper.cancel():
                 helper.result()
+        open_work.clear()
     return [results[number] for number in range(len(items))]
 
 

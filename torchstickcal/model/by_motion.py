@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from torchstickcal.geometry.triangulation import triangulate
-from torchstickcal.model.measurements import Measurements
+from torchstickcal.model.measurements import Measurements, views_of
 from torchstickcal.model.state import State
 
 _MANY_CONTRADICTED = 0.01
@@ -42,8 +42,8 @@ def found_by_motion(measurements: Measurements, state: State, agreeing: Tensor, 
     Returns:
         The state, and the keypoints that agree, (B, C, N); those given where nothing changes.
     """
-    seen, views = measurements.visible, agreeing.sum(1)
-    doubtful = agreeing.sum((1, 2)) < (1 - _MANY_CONTRADICTED) * seen.sum((1, 2))
+    seen, views = measurements.visible, views_of(agreeing)
+    doubtful = views.sum(1) < (1 - _MANY_CONTRADICTED) * views_of(seen).sum(1)
     unfound = (views < 2) & measurements.active & doubtful[:, None]
     suspect = (views == 2) & doubtful[:, None]
     if not bool((unfound | suspect).any()):

@@ -16,6 +16,7 @@ from torch import Tensor
 from torchstickcal.model.measurements import Measurements
 from torchstickcal.model.shrinkage import shrunk_logarithms
 from torchstickcal.model.state import State
+from torchstickcal.workers import map_with_idle_workers
 
 _CUT = 3.0
 """Residual, in standard deviations, to which larger ones are drawn in: a single outlier must not look like a pattern."""
@@ -165,12 +166,20 @@ def _bins(frames: int, device: torch.device) -> Tensor:
 def _residual_tracks(m: Measurements, state: State, sigma_px: Tensor, precision: torch.dtype) -> Tensor:
     """Whitened residuals by track, (B, P, C, 2, F); zero where not seen."""
     tracks = sigma_px.new_empty(m.sessions, m.points_per_frame, m.num_cameras, 2, m.frames, dtype=precision)
-    for columns, residuals, _ in m.residuals(state):
+
+    def put(columns: slice) -> None:
+        residuals, _ = m.residuals_at(state, columns)
         weights = _square_roots(m.confidence[..., columns]).unflatten(-1, (-1, m.points_per_frame)) / sigma_px[:, None, None]
         whitened = residuals.unflatten(-1, (-1, m.points_per_frame)) * weights.unsqueeze(2)
         whitened = whitened.where(weights.unsqueeze(2) > 0, 0.0).clamp(-_CUT, _CUT)
         frames = slice(columns.start // m.points_per_frame, columns.stop // m.points_per_frame)
         tracks[..., frames] = whitened.movedim(-1, 1).to(precision)
+
+    if any(tensor.requires_grad for tensor in (state.points, state.rotations, state.translations, sigma_px, m.pixels)):
+        for columns in m.chunks():  # threads may not write into one tensor with a graph of gradients
+            put(columns)
+    else:
+        map_with_idle_workers(put, m.chunks())
     return tracks
 
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass, replace
+from typing import overload
 
 import torch
 from torch import Tensor
@@ -24,6 +25,9 @@ from torchstickcal.workers import map_with_idle_workers
 
 _CHUNK_KEYPOINTS = {"cpu": 32_000, "cuda": 1_000_000}
 """Keypoints worked on at a time. What a CPU works on stays in its cache; elsewhere an operation should be worth its launch."""
+
+LONG_KEYPOINTS = 1_000_000
+"""Keypoints from which on a session is long: more than enough for everything that is found of it but its points."""
 
 
 @dataclass(frozen=True)
@@ -69,13 +73,16 @@ class Measurements:
             kept[list(use)] = True
             visible = visible & kept
         visible = visible & (visible.sum(0) >= 2)
-        keypoints = observations.keypoints.to(dtype)
+        keypoints = observations.keypoints
+        pixels = keypoints.new_empty(len(keypoints), 2, *visible.shape[1:], dtype=dtype)
+        for own, seen, given in zip(pixels, visible, keypoints, strict=True):  # one camera's copy at a time
+            own.copy_(torch.where(seen[..., None], given, 0.0).movedim(-1, 0))
         confidence = visible.to(dtype) if observations.confidence is None else observations.confidence.to(dtype)
         sticks = [s for s in scale_sticks(observations.sticks) if use is None or set(s.ends) <= set(use)]
         cameras = observations.cameras.batched()
         device = keypoints.device
         return Measurements(
-            pixels=torch.where(visible[..., None], keypoints, 0.0).movedim(-1, 1).flatten(2).contiguous()[None],
+            pixels=pixels.flatten(2)[None],
             confidence=torch.where(visible, confidence, 0.0).flatten(1)[None],
             cameras=cameras,
             frames=observations.num_frames,
@@ -140,26 +147,33 @@ class Measurements:
             unknowns=replace(self.unknowns, prior_sigma=self.unknowns.prior_sigma.detach()),
         )
 
-    def within(self, window: slice) -> Measurements:
+    def within(self, window: slice | Tensor) -> Measurements:
         """The measurements of some frames."""
         columns = self.columns_of(window)
         return replace(
             self,
             pixels=self.pixels[..., columns],
             confidence=self.confidence[..., columns],
-            frames=len(range(*window.indices(self.frames))),
+            frames=len(range(*window.indices(self.frames))) if isinstance(window, slice) else len(window),
             motion=self.motion and self.motion.at(columns),
         )
 
-    def columns_of(self, window: slice) -> slice:
-        """The columns of some frames, one after another."""
+    @overload
+    def columns_of(self, window: slice) -> slice: ...
+    @overload
+    def columns_of(self, window: Tensor) -> Tensor: ...
+    def columns_of(self, window: slice | Tensor) -> Columns:
+        """The columns of some frames: those of a slice one after another, or of any by their numbers."""
+        if isinstance(window, Tensor):
+            own = torch.arange(self.points_per_frame, device=self.pixels.device)
+            return (self.points_per_frame * window.to(own)[:, None] + own).flatten()
         start, stop, _ = window.indices(self.frames)
         return slice(start * self.points_per_frame, stop * self.points_per_frame)
 
     def keeping(self, kept: Tensor) -> Measurements:
         """The measurements without the keypoints outside a mask (B, C, N), and without points left with a single view."""
-        confidence = self.confidence * kept
-        return replace(self, confidence=confidence.mul_((confidence > 0).sum(-2, keepdim=True) >= 2))
+        kept = kept & self.visible
+        return replace(self, confidence=self.confidence.where(kept & (views_of(kept) >= 2).unsqueeze(-2), 0.0))
 
     def without_sticks(self) -> Measurements:
         """The same keypoints, of which no distance is known."""
@@ -171,7 +185,7 @@ class Measurements:
 
         Infinite where a keypoint is not seen or its point lies behind the camera.
         """
-        cameras = self.cameras_at(state)
+        cameras, chunks = self.cameras_at(state), self.chunks()
 
         def squared(columns: slice) -> Tensor:
             residuals, depth = self._residuals(state, cameras, columns)
@@ -179,14 +193,29 @@ class Measurements:
             distance = residuals.square().sum(-2) * confidence
             return distance.where((confidence > 0) & (depth > 0), torch.inf)
 
-        # Threads may not write into one tensor: the graph of its gradients would not survive that.
-        return torch.cat(map_with_idle_workers(squared, self.chunks()), dim=-1)
+        first = squared(chunks[0])
+        if len(chunks) == 1:
+            return first
+        # Threads may not write into one tensor where that has a graph of gradients, which would not survive it.
+        if first.requires_grad:
+            return torch.cat([first, *map_with_idle_workers(squared, chunks[1:])], dim=-1)
+        found = first.new_empty(self.confidence.shape)
+        found[..., chunks[0]] = first
+
+        def put(columns: slice) -> None:
+            found[..., columns] = squared(columns)
+
+        map_with_idle_workers(put, chunks[1:])
+        return found
 
     def residuals(self, state: State) -> Iterator[tuple[slice, Tensor, Tensor]]:
         """Projections minus keypoints (B, C, 2, n), pixels, and the points' depths (B, C, n), metres, by chunks of columns."""
-        cameras = self.cameras_at(state)
         for columns in self.chunks():
-            yield columns, *self._residuals(state, cameras, columns)
+            yield columns, *self.residuals_at(state, columns)
+
+    def residuals_at(self, state: State, columns: slice) -> tuple[Tensor, Tensor]:
+        """The same of some columns."""
+        return self._residuals(state, self.cameras_at(state), columns)
 
     def _residuals(self, state: State, cameras: Intrinsics, columns: slice) -> tuple[Tensor, Tensor]:
         x, y, z = state.in_cameras(columns, self.pixels.dtype).unbind(-2)
@@ -242,6 +271,11 @@ class Measurements:
         """P"""
         return self.num_columns // self.frames
 
+    @property
+    def is_long(self) -> bool:
+        """Whether this is one session of so many keypoints that what there is one of for each of them should not be kept."""
+        return self.sessions == 1 and are_many(self.num_cameras * self.num_columns)
+
     def point_index(self, name: str) -> int:
         """The index of a named point.
 
@@ -275,6 +309,23 @@ class Measurements:
     def by_frame(self, columns: Tensor) -> Tensor:
         """A tensor (..., N) as (..., F, P)."""
         return columns.unflatten(-1, (self.frames, -1))
+
+
+def are_many(keypoints: int) -> bool:
+    """Whether so many keypoints make a session long."""
+    return keypoints >= LONG_KEYPOINTS
+
+
+def views_of(seen: Tensor) -> Tensor:
+    """How many cameras see each point, (B, N), of a mask (B, C, N). The sum of a mask would first be a copy of it in int64."""
+    return seen.view(torch.uint8).sum(-2, dtype=torch.int16)
+
+
+def count_of(seen: Tensor) -> Tensor:
+    """How many are True in each row of a mask (B, C, N), (B, C); without such a copy where rows are long."""
+    if not are_many(seen.numel()):
+        return seen.sum(-1)
+    return torch.stack([row.count_nonzero() for row in seen.flatten(0, 1)]).view(seen.shape[:-1])
 
 
 def _lenses(sessions: Sequence[Intrinsics]) -> Tensor | None:

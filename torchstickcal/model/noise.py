@@ -26,6 +26,7 @@ _MIN_SIGMA_PX = 1e-4
 _MIN_ACCELERATION_M = 1e-5
 _MIN_VARIANCE_RATIO = 0.05
 """Smallest variance of the true acceleration, as a fraction of the variance that noise gives to the measured acceleration."""
+_COLUMNS_AT_ONCE = 2**20
 _NEAR_FRAMES, _USUAL_FRAMES = 12, 3.0
 """Frames before and after that tell how a point accelerates, less the farther away; all frames together count as this many."""
 
@@ -61,7 +62,7 @@ def near_keypoints(measurements: Measurements, squared_residuals: Tensor) -> Ten
             break
         views = near.sum(1)
     mask = torch.zeros_like(measurements.by_frame(measurements.visible))
-    mask[:, :, _frames_looked_at(measurements)] = near
+    mask[:, :, frames_looked_at(measurements)] = near
     return mask.flatten(2)
 
 
@@ -96,8 +97,15 @@ def estimate_acceleration_m(measurements: Measurements, points: Tensor, point_va
         point_variance: what the noise explains of the variance of each triangulated point, mean over the three axes, (B, N),
             square metres.
     """
-    complete = consecutive(measurements.by_frame(measurements.active), len(SmoothnessLoss.stencil))
-    x, noise = measurements.by_frame(points), measurements.by_frame(point_variance).double()
+    active, x, noise = (measurements.by_frame(tensor) for tensor in (measurements.active, points, point_variance))
+    together = max(1, _COLUMNS_AT_ONCE // (measurements.sessions * measurements.frames))
+    parts = zip(*(tensor.split(together, dim=-1) for tensor in (active, x, noise)), strict=True)
+    return torch.cat([_acceleration_m(*part) for part in parts], dim=-1)
+
+
+def _acceleration_m(active: Tensor, x: Tensor, noise: Tensor) -> Tensor:
+    """That of some of the points: which are active (B, F, P), where they are (B, 3, F, P), and their variance (B, F, P)."""
+    complete, noise = consecutive(active, len(SmoothnessLoss.stencil)), noise.double()
     measured = combined(x, SmoothnessLoss.stencil, dim=-2).square().mean(1)
     expected = noise[:, 2:] + 4 * noise[:, 1:-1] + noise[:, :-2]
     weights = complete / expected.clamp_min(_MIN_ACCELERATION_M**2)
@@ -123,7 +131,8 @@ def _sums_near(values: Tensor) -> Tensor:
     return sums.view_as(tracks).movedim(2, 1)
 
 
-def _frames_looked_at(measurements: Measurements) -> Tensor:
+def frames_looked_at(measurements: Measurements) -> Tensor:
+    """The frames whose keypoints tell the noise: all, or 2000 of them evenly spaced."""
     return torch.linspace(0, measurements.frames - 1, min(measurements.frames, _MAX_FRAMES)).round().long()
 
 
@@ -131,7 +140,7 @@ def _of_some_frames(measurements: Measurements, columns: Tensor) -> Tensor:
     """A tensor (B, C, N) by frame, (B, C, F', P), of the frames that are looked at; numbers in float64."""
     by_frame = measurements.by_frame(columns)
     if measurements.frames > _MAX_FRAMES:
-        by_frame = by_frame[:, :, _frames_looked_at(measurements)]
+        by_frame = by_frame[:, :, frames_looked_at(measurements)]
     return by_frame.double() if by_frame.is_floating_point() else by_frame
 
 

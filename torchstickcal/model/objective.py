@@ -57,6 +57,12 @@ class Objective:
         """The objective of some of the sessions."""
         return Objective(self.measurements[sessions], {name: loss.of(sessions) for name, loss in self.losses.items()})
 
+    def within(self, window: slice) -> Objective:
+        """The objective of some frames. What couples them with others is no part of it."""
+        frames = self.measurements.frames
+        losses = {n: loss.within(window, frames) if isinstance(loss, TrackLoss) else loss for n, loss in self.losses.items()}
+        return Objective(self.measurements.within(window), losses)
+
     def information_of(self, name: str) -> Tensor:
         """1 / sigma^2 of a camera-point loss at every column, (1 | B, 1, N)."""
         return self._information[name]
@@ -141,15 +147,19 @@ class Objective:
         Couplings between points are ignored. It is that of the normal equations, differentiable by measurements and state; zero
         where a point is not known.
         """
-        m, points = self.measurements, self.measurements.by_frame(state.points)
-        by_chunk = map_with_idle_workers(lambda columns: self._image_information(state, columns), m.chunks())
-        information = torch.cat(by_chunk, dim=-1)
+        by_chunk = map_with_idle_workers(lambda columns: self._point_variance(state, columns), self.measurements.chunks())
+        return torch.cat(by_chunk, dim=-1)
+
+    def _point_variance(self, state: State, columns: slice) -> Tensor:
+        """That of the points of some frames' columns n, (B, n); differentiable."""
+        m, information = self.measurements, self._image_information(state, columns)
+        points, active = (tensor[..., columns].unflatten(-1, (-1, m.points_per_frame)) for tensor in (state.points, m.active))
         for loss in self._frame.values():
-            own = loss.point_information(points, m.sticks, m.lengths_m[:, None], m.by_frame(m.active))
+            own = loss.point_information(points, m.sticks, m.lengths_m[:, None], active)
             information = information + own.flatten(-2)
-        known = m.active[:, None]
+        known = m.active[:, columns]
         identity = information.new_tensor(IDENTITY)[:, None]
-        return inverse_diagonal(torch.where(known, information, identity)).mean(1).where(m.active, 0.0)
+        return inverse_diagonal(torch.where(known[:, None], information, identity)).mean(1).where(known, 0.0)
 
     def _image_information(self, state: State, columns: slice) -> Tensor:
         """What the camera-point losses know of the points of some columns n, (B, 6, n); differentiable."""

@@ -19,6 +19,7 @@ from torchstickcal.pipeline.adjustment import Adjustment
 from torchstickcal.pipeline.check import CameraCheck
 from torchstickcal.pipeline.conclude import conclude
 from torchstickcal.pipeline.inference import inference_of
+from torchstickcal.pipeline.part import adjusted_from_part
 from torchstickcal.pipeline.run import Run
 from torchstickcal.pipeline.scale import ending_in_scale
 from torchstickcal.pipeline.selection import ModelSelection
@@ -164,10 +165,11 @@ def calibration_steps(
 
     # 1. Synchronise: where the cameras' frames clearly do not belong together, find the time offsets.
     clocks = models.clocks_unlike_given if "time_offset" in models.allowed else None
-    begun = models.begun() if clocks is None else None
 
     # 2. Initialise rig and points, and 3. adjust them in stages, at the time offsets at which the views fit together best.
-    first = None if begun is None else (yield Due(adjust_cameras, begun, run))
+    first = adjusted_from_part(models, observations, run, start)
+    if first is None and clocks is None and (begun := models.begun()) is not None:
+        first = yield Due(adjust_cameras, begun, run)
     adjusted, clocks = models.adjusted(clocks, first)
 
     # 4. Check the given lenses and clocks when that is first asked for; with refine="auto", estimate what is contradicted.

@@ -24,7 +24,7 @@ from torchstickcal.quality.evidence import Evidence
 from torchstickcal.quality.judge import judged
 from torchstickcal.result import Calibration, CameraParameter
 from torchstickcal.solvers.uncertainty import camera_covariance, likelihood, ruler_covariance, scale_covariance, without_scale
-from torchstickcal.workers import on_worker
+from torchstickcal.workers import map_with_idle_workers, on_worker
 
 
 def conclude(
@@ -111,17 +111,22 @@ def evidence_of(
 def keypoint_index(ended: Adjustment) -> Tensor:
     """The point whose given keypoint each point uses (C, F, P), in the cameras' own frames."""
     own, index = ended.frames[0].to_own(ended.labels.index[0], -1), torch.arange(ended.observations[0].num_points)
-    return torch.where(own < 0, index.to(own.device), own)
+    unused = own < 0
+    return torch.where(unused, index.to(own.device), own) if bool(unused.any()) else own
 
 
 def residuals_of(ended: Adjustment) -> Tensor:
     """Projections minus keypoints (C, G, P, 2) at the common frames, pixels; NaN where not seen or the point is not known."""
     measurements = ended.measurements
     known = measurements.visible & ended.last.inliers.any(1, keepdim=True)
-    residuals = torch.empty_like(measurements.pixels, dtype=torch.float64)
-    for columns, found, _ in measurements.residuals(ended.state):
-        residuals[..., columns] = found.double().where(known[..., columns].unsqueeze(-2), torch.nan)
-    return measurements.by_frame(residuals[0]).movedim(1, -1)
+    residuals = measurements.pixels.new_empty(known.shape[1], known.shape[2], 2, dtype=torch.float64)
+
+    def put(columns: slice) -> None:
+        found, _ = measurements.residuals_at(ended.state, columns)
+        residuals[:, columns] = found[0].double().where(known[0][:, None, columns], torch.nan).movedim(1, -1)
+
+    map_with_idle_workers(put, measurements.chunks())
+    return residuals.unflatten(1, (measurements.frames, -1))
 
 
 def _covariances(ended: Adjustment, config: Config) -> tuple[Tensor, Tensor]:

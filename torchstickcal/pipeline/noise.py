@@ -19,10 +19,11 @@ from torchstickcal.lazy import cached_property
 from torchstickcal.losses import Loss, LossContext, LossSettings, TrackLoss
 from torchstickcal.model.correlation import CorrelationGates, ErrorCorrelation, error_correlation
 from torchstickcal.model.measurements import Measurements
-from torchstickcal.model.noise import estimate_acceleration_m, sigma_px_of
+from torchstickcal.model.noise import estimate_acceleration_m, frames_looked_at, sigma_px_of
 from torchstickcal.model.objective import Objective
 from torchstickcal.model.state import State
 from torchstickcal.shapes import extended
+from torchstickcal.solvers.following import minimum_with_points_following
 from torchstickcal.solvers.linearised import Linearised
 from torchstickcal.solvers.newton import minimum_near
 
@@ -69,6 +70,15 @@ class Chosen:
         """The standard deviation of the keypoints, (B, P), pixels; arguments as of :func:`sigma_px_of`."""
         return sigma_px_of(given, squared_residuals, self.mask, self.cut)
 
+    def sigma_px_at(self, given: Measurements, state: State) -> Tensor:
+        """The same at a state: only the frames that are looked at are computed."""
+        frames = frames_looked_at(given)
+        if len(frames) == given.frames:
+            return self.sigma_px(given, given.squared_residuals(state))
+        columns, some = given.columns_of(frames), given.within(frames)
+        squared_residuals = some.squared_residuals(replace(state, points=state.points[..., columns]))
+        return sigma_px_of(some, squared_residuals, self.mask[..., columns], self.cut)
+
 
 @dataclass(frozen=True)
 class NoiseGates:
@@ -110,6 +120,11 @@ class StageNoise:
         wanted = [name for loss in self.stage.losses.values() for name, value in vars(loss).items() if value == _ESTIMATED]
         return any(name != _SIGMA_PX or self.given_sigma_px is None for name in wanted)
 
+    @property
+    def has_track_losses(self) -> bool:
+        """Whether a loss of the stage couples consecutive frames."""
+        return any(map(_is_track, self.stage.losses.items()))
+
     def chosen(self, kept: Measurements, near: Callable[[], Chosen]) -> Chosen:
         """From which keypoints the noise is estimated once no more are rejected: those that take part in the stage.
 
@@ -124,19 +139,19 @@ class StageNoise:
         return near() if rejects is None else Chosen(kept.visible, rejects)
 
     def decided(
-        self, kept: Measurements, state: State, squared_residuals: Tensor, chosen: Chosen, times: Tensor | None = None
+        self, kept: Measurements, state: State, sigma_px: Tensor, chosen: Chosen, times: Tensor | None = None
     ) -> tuple[dict[str, Loss], NoiseLevels, NoiseGates]:
         """The stage's losses at a state, their noise, and what was decided about it.
 
         Args:
             kept: the keypoints that take part in the stage.
             state: where the errors are looked at.
-            squared_residuals: of all keypoints at the state.
-            chosen: the keypoints from which their noise is estimated.
+            sigma_px: the standard deviation of the keypoints there, (B, P), pixels.
+            chosen: the keypoints from which it was estimated.
             times: (B, P), as many keypoints of each point as count as one where the stage estimates that; NaN where it is to be
                 estimated, None for all.
         """
-        found = _Levels(kept, state, chosen.sigma_px(kept, squared_residuals), times=times)
+        found = _Levels(kept, state, sigma_px, times=times)
         losses = self._losses(kept, found.sigma_px, found.correlation_frames, found.acceleration_m)
         return losses, found.levels, NoiseGates(chosen, found.gates)
 
@@ -149,8 +164,7 @@ class StageNoise:
             state: where the errors are looked at.
             gates: what was decided.
         """
-        sigma_px = gates.chosen.sigma_px(given, given.squared_residuals(state))
-        found = _Levels(kept, state, sigma_px, gates)
+        found = _Levels(kept, state, gates.chosen.sigma_px_at(given, state), gates)
         self._losses(kept, found.sigma_px, found.correlation_frames, found.acceleration_m)
         return found.levels
 
@@ -217,14 +231,17 @@ class HeldNoise:
         Returns:
             The objective at the minimum, the levels there, and in which sessions they were found, (B,).
         """
-        found: list[NoiseLevels] = []
+        kept, found = self._kept(measurements), list[NoiseLevels]()
 
         def objective_at(at: State) -> Objective:
             known = levels if at is state else None
-            found[:] = [self.levels(measurements, at) if known is None else known]
-            return self.objective(measurements, found[0])
+            found[:] = [self.noise.levels(measurements, kept, at, self.gates) if known is None else known]
+            return Objective(kept, self.noise.losses(kept, found[0]))
 
-        minimum, converged = minimum_near(objective_at, state, cameras_free=True, to_rounding=to_rounding)
+        if measurements.is_long and not to_rounding and not self.noise.has_track_losses:
+            minimum, converged = minimum_with_points_following(objective_at, state)
+        else:
+            minimum, converged = minimum_near(objective_at, state, cameras_free=True, to_rounding=to_rounding)
         return minimum, found[0], converged
 
     def _kept(self, measurements: Measurements) -> Measurements:

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from torchstickcal.errors import ObservationError, RigError
 from torchstickcal.lazy import cached_property
-from torchstickcal.model.measurements import Measurements
+from torchstickcal.model.measurements import Measurements, count_of
 from torchstickcal.model.unknowns import REFINEMENTS, clock_refinements, with_refinements
 from torchstickcal.observations import Observations
 from torchstickcal.pipeline.adjust import adjust_again, adjust_cameras, begin, begin_at_nearest_frames, measured
@@ -109,7 +109,7 @@ class ModelSelection:
         found, clocks = self._found(clocks, first)
         if self._start is not None and not any(_fits(one, _CLEAR_SHARE, _CLEAR_FOCAL_SHARE) for one in found):
             found, clocks = self._without_start(found, clocks)
-        best = self._turned_back(min(found, key=_median_squared_residual))
+        best = self._turned_back(min(found, key=_median_squared_residual) if len(found) > 1 else found[0])
         return best if set(self.named) <= set(best.refined) else self._with(best, self.named), clocks
 
     def _turned_back(self, found: Adjustment) -> Adjustment:
@@ -118,7 +118,7 @@ class ModelSelection:
         The latter only if it fits better, which it does not where the videos are mirrored.
         """
         m, names = found.measurements, found.observations[0].point_names
-        points = m.by_frame(found.state.points[0].where(found.kept.active[0], torch.nan))
+        points = m.by_frame(found.state.points[0].where(found.last.inliers[0].any(0), torch.nan))
         if mirrored_share(points, names) <= MIRRORED_SHARE:
             return found
         reverse = replace(found[0], state=found.state.depth_reversed(m.active))
@@ -279,7 +279,7 @@ def _fits(
     adjustment: Adjustment, least_share: float = _FITTING_SHARE, largest_focal_share: float = _FITTING_FOCAL_SHARE
 ) -> bool:
     """Whether the cameras agree with one another as those of one scene do."""
-    share = adjustment.last.inliers.sum() / adjustment.measurements.visible.sum()
+    share = count_of(adjustment.last.inliers).sum() / count_of(adjustment.measurements.visible).sum()
     noise = adjustment.last.sigma_px.median() / adjustment.measurements.cameras.focal_px.mean()
     return adjustment.converged and float(share) > least_share and float(noise) < largest_focal_share
 

@@ -7,10 +7,12 @@ import time
 import torch
 from torch import Tensor
 
+from torchstickcal.allocator import give_back_freed_memory
 from torchstickcal.model.measurements import Measurements
 from torchstickcal.model.noise import NEAR_SIGMAS, near_keypoints
 from torchstickcal.model.objective import Objective
-from torchstickcal.pipeline.noise import Chosen, HeldNoise
+from torchstickcal.model.state import State
+from torchstickcal.pipeline.noise import Chosen, HeldNoise, NoiseGates, NoiseLevels, StageNoise
 from torchstickcal.pipeline.run import Run
 from torchstickcal.pipeline.scale import rulers, scale_factors
 from torchstickcal.pipeline.stage import StageResult
@@ -35,16 +37,25 @@ def settled(name: str, measurements: Measurements, result: StageResult, run: Run
         The result, and in which sessions it was found, (B,). Others may be anywhere on the way.
     """
     began, noise, at = time.perf_counter(), run.noise_of(result.stage), result.minimum
-    kept, squared = measurements.keeping(result.inliers), measurements.squared_residuals(at)
-
-    def near() -> Chosen:
-        return Chosen(near_keypoints(measurements, squared), NEAR_SIGMAS)
-
-    _, levels, gates = noise.decided(kept, at, squared, noise.chosen(kept, near))
+    levels, gates = _decided(noise, measurements, result.inliers, at)
+    if measurements.is_long:
+        give_back_freed_memory()
     held = HeldNoise(noise, gates, result.inliers)
     found, levels, converged = held.minimum_near(measurements, at, run.to_rounding, levels)
     run.took(name, time.perf_counter() - began)
     return _with_minimum(result, found, run)._replace(noise=levels, gates=gates, agrees=converged), converged
+
+
+def _decided(noise: StageNoise, measurements: Measurements, inliers: Tensor, at: State) -> tuple[NoiseLevels, NoiseGates]:
+    """The noise at a state, and what is decided about it, by the keypoints that take part."""
+
+    def near() -> Chosen:
+        return Chosen(near_keypoints(measurements, measurements.squared_residuals(at)), NEAR_SIGMAS)
+
+    kept = measurements.keeping(inliers)
+    chosen = noise.chosen(kept, near)
+    _, levels, gates = noise.decided(kept, at, chosen.sigma_px_at(measurements, at), chosen)
+    return levels, gates
 
 
 @torch.no_grad()

@@ -4,16 +4,18 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
+from functools import partial
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
+from torchstickcal.allocator import give_back_freed_memory
 from torchstickcal.config import Stage
 from torchstickcal.errors import CalibrationError
 from torchstickcal.losses import Loss
 from torchstickcal.model.by_motion import found_by_motion
-from torchstickcal.model.measurements import Measurements
+from torchstickcal.model.measurements import Measurements, count_of
 from torchstickcal.model.noise import NEAR_SIGMAS, near_keypoints
 from torchstickcal.model.objective import Objective
 from torchstickcal.model.state import State
@@ -21,6 +23,7 @@ from torchstickcal.pipeline.noise import Chosen, NoiseGates, NoiseLevels
 from torchstickcal.pipeline.run import Run
 from torchstickcal.pipeline.scale import outvoted_factors, rulers, scale_factors
 from torchstickcal.solvers import StageRecord, Stop, Termination, solver
+from torchstickcal.solvers.windows import can_be_divided, gauss_newton_by_windows
 
 _RESOLUTION = {torch.float64: 0.0, torch.float32: 1e-7}
 """Relative decrease of the cost that can be distinguished from rounding."""
@@ -127,19 +130,20 @@ def run_stage(
             state, squared_residuals = found, measurements.squared_residuals(found)
     noise = run.noise_of(stage)
     chosen = near if stage.cameras == "free" else noise.chosen(measurements, lambda: near)
-    losses, levels, gates = noise.decided(measurements, state, squared_residuals, chosen, times)
+    sigma_px = chosen.sigma_px(measurements, squared_residuals)
     del squared_residuals
+    losses, levels, gates = noise.decided(measurements, state, sigma_px, chosen, times)
+    if measurements.is_long:
+        give_back_freed_memory()
     objective = Objective(measurements, losses)
     least = least if run.config.solver == "gauss_newton" else 0.0
     tolerance = max(stage.cost_tolerance, least, _RESOLUTION[measurements.pixels.dtype])
-    outcome = solver(run.config.solver)(
-        objective,
-        state,
-        cameras_free=stage.cameras == "free",
-        termination=Termination(stage.max_iterations, tolerance, newton_follows=least > 0, leaves_last_step=run.to_rounding),
-        stage=name,
-        listener=run.listener,
-    )
+    termination = Termination(stage.max_iterations, tolerance, newton_follows=least > 0, leaves_last_step=run.to_rounding)
+    solve = partial(solver(run.config.solver), cameras_free=stage.cameras == "free")
+    plain = run.config.solver == "gauss_newton" and not run.to_rounding
+    if plain and stage.cameras == "held" and can_be_divided(objective):
+        solve = gauss_newton_by_windows
+    outcome = solve(objective, state, termination=termination, stage=name, listener=run.listener)
     state = minimum = outcome.state
     stops = _judged(outcome.stops, Stop.UNDETERMINED, ~_determined(given, measurements))
     if stage.rescale:
@@ -163,12 +167,12 @@ def agreeing_cameras(given: Measurements, kept: Measurements) -> Tensor:
         given: all keypoints.
         kept: those that agree with each other.
     """
-    return kept.visible.sum(2) > _LEAST_AGREEING_SHARE * given.visible.sum(2)
+    return count_of(kept.visible) > _LEAST_AGREEING_SHARE * count_of(given.visible)
 
 
 def _determined(given: Measurements, kept: Measurements) -> Tensor:
     """Whether the keypoints that agree determine a session's cameras and points, (B,); arguments as above."""
-    measured = 2 * kept.visible.sum((1, 2)) + kept.stick_active.sum((1, 2))
+    measured = 2 * count_of(kept.visible).sum(1) + kept.stick_active.sum((1, 2))
     unknown = 3 * kept.active.sum(1) + 6 * (kept.num_cameras - 1) + kept.unknowns.count
     return (measured > unknown) & agreeing_cameras(given, kept).all(1)
 

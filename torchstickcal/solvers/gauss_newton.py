@@ -12,6 +12,8 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
+from torchstickcal.allocator import keep_freed_arrays
+from torchstickcal.model.measurements import count_of
 from torchstickcal.model.objective import Objective
 from torchstickcal.model.state import State
 from torchstickcal.solvers.base import IterationRecord, Listener, Outcome, Stop, Termination
@@ -29,7 +31,6 @@ _MAX_DAMPED_SHARE = 0.5
 _NEGLIGIBLE_SHARE = 0.01
 """A step that predicts less than this share of the cost tolerance is not tried."""
 _EXACT_COST_PER_KEYPOINT = 1e-18
-_LARGE_BLOCK_BYTES = 31 * 2**20
 
 
 def gauss_newton(
@@ -45,9 +46,9 @@ def gauss_newton(
 
     A step is accepted only if it lowers the cost. So the result is never worse than the initial state.
     """
-    _raise_allocator_threshold()
+    keep_freed_arrays()
     device = state.points.device
-    keypoints = objective.measurements.visible.sum((1, 2)).tolist()
+    keypoints = count_of(objective.measurements.visible).sum(1).tolist()
     sessions = [_SessionControl(termination, _EXACT_COST_PER_KEYPOINT * count) for count in keypoints]
     records: list[list[IterationRecord]] = [[] for _ in sessions]
     best = trial = state
@@ -211,15 +212,6 @@ class _SessionControl:
         self.damping = max(damping, 1e-8) * 10
         if self.damping > _MAX_DAMPING:
             self.stop = Stop.DIVERGED
-
-
-def _raise_allocator_threshold() -> None:
-    """Make the C library keep freed arrays for reuse.
-
-    glibc returns a large block to the system when it is freed, and the page faults of the next allocation then cost more than
-    the arithmetic. Its threshold for a large block rises to the largest block freed so far: so free one larger than our arrays.
-    """
-    torch.empty(_LARGE_BLOCK_BYTES, dtype=torch.uint8)
 
 
 def _largest_components(step: Step) -> list[float]:

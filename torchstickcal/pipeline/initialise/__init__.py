@@ -24,6 +24,7 @@ from torchstickcal.model.state import State
 from torchstickcal.pipeline.initialise.graph import propagate, spanning_tree
 from torchstickcal.pipeline.initialise.pairs import relate
 from torchstickcal.pipeline.initialise.views import Views, undistorted_keypoints
+from torchstickcal.workers import map_with_idle_workers
 
 __all__ = ["initialise", "small_squared_residuals", "triangulated"]
 
@@ -117,11 +118,14 @@ def triangulated(
     """
     scale, undistorted = _kernel_scale(measurements, settings), None if views is None else views.undistorted
     points = rotations.new_zeros(1, 3, measurements.num_columns)
-    for columns in measurements.chunks():
+
+    def triangulate(columns: slice) -> None:
         rays = undistorted_keypoints(measurements, columns) if undistorted is None else undistorted[..., columns]
         weights = measurements.confidence[0][:, columns].double() * rays.isfinite().all(1)
         chunk = triangulate_robustly(rotations[0], translations[0], rays.nan_to_num(), weights, scale=scale)
         points[0, :, columns] = chunk.nan_to_num()
+
+    map_with_idle_workers(triangulate, measurements.chunks())
     return points
 
 

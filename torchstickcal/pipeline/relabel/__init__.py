@@ -172,17 +172,21 @@ class _Residuals:
     """(C, F, P), square pixels, 0 where not seen"""
     visible: Tensor
     """(C, F, P)"""
-    pixels: Tensor
-    """(C, 2, F, P), NaN where not seen"""
     sigma_px: Tensor
     """(P,), a cautious estimate of the noise of each point's keypoints"""
+    measurements: Measurements
 
     @staticmethod
     def of(measurements: Measurements, state: State) -> _Residuals:
         squared = measurements.by_frame(measurements.squared_residuals(state)[0])
         visible = measurements.by_frame(measurements.visible[0])
-        pixels = measurements.by_frame(measurements.pixels[0]).double().where(visible[:, None], torch.nan)
-        return _Residuals(squared.where(visible, 0.0), visible, pixels, _noise(squared, visible))
+        return _Residuals(squared.where(visible, 0.0), visible, _noise(squared, visible), measurements)
+
+    @property
+    def pixels(self) -> Tensor:
+        """(C, 2, F, P), NaN where not seen."""
+        m = self.measurements
+        return m.by_frame(m.pixels[0]).double().where(self.visible[:, None], torch.nan)
 
     @property
     def gross(self) -> Tensor:
@@ -203,7 +207,8 @@ class _Residuals:
         many = gross.sum(-1) > _CONTRADICTING_SHARE * self.visible.sum(-1)
         if not many.any():
             return many
-        extent = (self.pixels - self.pixels.nanmean(-1, keepdim=True)).square().sum(1)
+        pixels = self.pixels
+        extent = (pixels - pixels.nanmean(-1, keepdim=True)).square().sum(1)
         far = self.squared.where(self.visible, torch.nan).nanmedian(-1).values > _FAR_SHARE**2 * extent.nanmean(-1)
         return many & far
 

@@ -145,4 +145,5 @@ class Gradient(Evaluated):
             if self._free_cameras:
                 points = self.state.points[..., columns].to(slopes.gradient)
                 sums.add_gradient(points, slopes.gradient, slopes.unknown_gradient)
-        return {name: slopes._replace(gradient=slopes.gradient[..., :0]) for name, slopes in found.items()}, sums
+        empty = self.point_gradient[..., :0]  # a view of a chunk's own gradient would keep that
+        return {name: slopes._replace(gradient=empty) for name, slopes in found.items()}, sums

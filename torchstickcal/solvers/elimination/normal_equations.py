@@ -147,6 +147,7 @@ class NormalEquations(Evaluated):
         exact: whether to use the exact Hessian instead of the Gauss-Newton approximation. It includes the second derivatives of
             robust kernels, projections and lengths. Track losses must be quadratic. The exact Hessian need not be positive
             definite except at a minimum.
+        exact_frames: whether it then also includes those of lengths. They are negative at many ends of sticks.
     """
 
     point_hessian: Tensor
@@ -163,13 +164,17 @@ class NormalEquations(Evaluated):
         cameras_free: bool,
         damping: float | Tensor = 0.0,
         exact: bool = False,
+        exact_frames: bool = True,
     ) -> None:
         super().__init__(objective, state, cameras_free)
-        m, self._exact = objective.measurements, exact
+        m, self._exact, self._exact_frames = objective.measurements, exact, exact and exact_frames
         self._damping = torch.as_tensor(damping, dtype=torch.float64, device=state.points.device).expand(m.sessions)
-        self._parts = parts(m, objective.clusters, self._add_point_losses())
+        self._parts = parts(m, objective.clusters, self._add_point_losses(), cameras_free)
         self._cache: dict[int, _EliminatedPart] = {}
-        self._add_camera_point_losses()
+        if cameras_free:
+            self._add_camera_point_losses()
+        else:
+            self._add_images_to_points()
 
     def step(self) -> Step:
         """The Levenberg-Marquardt step."""
@@ -239,6 +244,22 @@ class NormalEquations(Evaluated):
         finite = rig.isfinite().all(1) & points.flatten(1).isfinite().all(1)
         return cameras, unknowns, points, (failed == 0) & finite
 
+    def solve_points(self, point_rhs: Tensor) -> Tensor:
+        """``H_xx^-1 b`` (B, 3, N), for a right-hand side b (B, 3, N): what the points do while the cameras are held."""
+        points = torch.empty_like(point_rhs)
+
+        def solve(part: Part) -> None:
+            elimination = part.eliminate(raised(self.point_hessian[..., part.columns], self._damping))
+            points[..., part.columns] = elimination.solve(point_rhs[..., part.columns].to(self.point_hessian.dtype)).to(points)
+
+        map_with_idle_workers(solve, self._parts)
+        return points
+
+    def moved(self, state: State, rig_step: Tensor) -> State:
+        """A state after a step (B, 6 C' + K) of the cameras alone."""
+        cameras, unknowns = self._split(rig_step)
+        return state.retracted(cameras, torch.zeros_like(state.points[..., :1]), unknowns)
+
     def point_response(self) -> Tensor:
         """``-H_xx^-1 H_xc``: movement of the points per unit step of the cameras, (B, 6 C' + K, 3, N)."""
         points = self.state.points
@@ -266,7 +287,7 @@ class NormalEquations(Evaluated):
         """Add the frame losses. Returns the blocks between different points of a frame."""
         m, within = self.objective.measurements, WithinFrame()
         hessian = m.by_frame(self.point_hessian)
-        for name, terms in self.objective.linearise_frames(self.state, self._exact).items():
+        for name, terms in self.objective.linearise_frames(self.state, self._exact_frames).items():
             self._add_frame_gradient(name, terms)
             members = self.objective.groups[name].unbind(1)
             for number, points in enumerate(members):
@@ -295,8 +316,26 @@ class NormalEquations(Evaluated):
                 hessian[:, axis] += own
         return BetweenFrames(*between)
 
+    def _add_images_to_points(self) -> None:
+        """Linearise the camera-point losses for cameras that are held."""
+
+        def linearised(columns: slice) -> dict[str, CameraPointTerms]:
+            terms = self._linearise(columns)
+            for term in terms.values():
+                self.point_gradient[..., columns] += term.gradient.sum(1)
+                self.point_hessian[..., columns] += term.hessian.sum(1)
+            return {name: term._replace(gradient=empty, hessian=empty) for name, term in terms.items()}
+
+        empty = self.state.points[:, :0, 0]
+        for terms in map_with_idle_workers(linearised, self.objective.measurements.chunks()):
+            for name, term in terms.items():
+                self._add_images(name, term)
+        self._sum_up_images(self._new_sums())
+        self.reduced, self.reduced_gradient = empty.new_zeros(len(empty), 0, 0), empty.new_zeros(len(empty), 0)
+        self._rig_diagonal = self.reduced_gradient
+
     def _add_camera_point_losses(self) -> None:
-        """Linearise the camera-point losses of every part and, if the cameras are free, build the reduced camera system."""
+        """Linearise the camera-point losses of every part, and build the reduced camera system."""
         m, zeros = self.objective.measurements, self.state.points.new_zeros
         size = 6 * self._free_cameras + self._unknowns.count
         reduced, reduced_gradient, sums = zeros(m.sessions, size, size), zeros(m.sessions, size), self._new_sums()
@@ -307,10 +346,9 @@ class NormalEquations(Evaluated):
         for index, terms in enumerate(found):
             for name, term in terms.images:
                 self._add_images(name, term)
-            if self._free_cameras:
-                sums.include(terms.sums)
-                reduced -= terms.rows_squared
-                reduced_gradient -= terms.rows_gradient
+            sums.include(terms.sums)
+            reduced -= terms.rows_squared
+            reduced_gradient -= terms.rows_gradient
             if terms.eliminated is not None:
                 self._cache[index] = terms.eliminated
         self._sum_up_images(sums)
@@ -321,7 +359,7 @@ class NormalEquations(Evaluated):
         self.reduced_gradient = reduced_gradient + torch.cat([self.camera_gradient.flatten(1), self.unknown_gradient], dim=1)
 
     def _part_terms(self, part: Part, keeps: bool, keeps_rows: bool) -> _PartTerms:
-        """Linearise a part's camera-point losses, add them to the points' blocks, and eliminate it if the cameras are free."""
+        """Linearise a part's camera-point losses, add them to the points' blocks, and eliminate it."""
         images: list[tuple[str, CameraPointTerms]] = []
         chunks: list[_CameraCoupling] = []
         sums, empty = self._new_sums(), self.state.points[:, :0, 0]
@@ -331,11 +369,8 @@ class NormalEquations(Evaluated):
             gradient, hessian, unknown = _sum_over_losses(terms)
             self.point_gradient[..., columns] += gradient.sum(1)
             self.point_hessian[..., columns] += hessian.sum(1)
-            if self._free_cameras:
-                sums.add(self._points(columns), gradient, hessian, unknown)
-                chunks.append(self._camera_coupling(gradient, hessian, unknown))
-        if not self._free_cameras:
-            return _PartTerms(images, sums, empty, empty, None)
+            sums.add(self._points(columns), gradient, hessian, unknown)
+            chunks.append(self._camera_coupling(gradient, hessian, unknown))
         eliminated = self._eliminate(part, chunks)
         rows = eliminated.solved_rows(self._points(part.columns))
         solved = eliminated.elimination.forward_solve(self.point_gradient[..., part.columns])

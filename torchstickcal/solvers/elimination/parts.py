@@ -15,8 +15,9 @@ from torchstickcal.model.unknowns import Columns
 from torchstickcal.solvers.elimination.points import PointElimination
 from torchstickcal.solvers.elimination.tracks import TrackElimination, Tracks, rows_per_block
 
-_MAX_TRACK_POINTS = 3000
-"""Number of points of the tracks that are eliminated together. Their right-hand sides should fit into the cache."""
+_MAX_TRACK_POINTS, _MAX_HELD_TRACK_POINTS = 3000, 50_000
+"""Number of points of the tracks that are eliminated together, and the same for held cameras. Their right-hand sides should fit
+into the cache; for held cameras there is only one."""
 
 Cluster = tuple[int, ...]
 """Points of one frame that losses couple with each other."""
@@ -78,19 +79,22 @@ class Part(Protocol):
         ...
 
 
-def parts(measurements: Measurements, clusters: Sequence[Cluster], couplings: Couplings) -> list[Part]:
+def parts(
+    measurements: Measurements, clusters: Sequence[Cluster], couplings: Couplings, cameras_free: bool = True
+) -> list[Part]:
     """A partition of all columns.
 
     Args:
         measurements: the sessions.
         clusters: the points that losses couple within a frame.
         couplings: the blocks off the diagonal.
+        cameras_free: whether the cameras are unknowns too.
     """
-    m = measurements
+    m, most = measurements, _MAX_TRACK_POINTS if cameras_free else _MAX_HELD_TRACK_POINTS
     if couplings.between is not None:
         all_frames = slice(0, m.frames)
         single = [(point,) for point in range(m.points_per_frame) if not any(point in cluster for cluster in clusters)]
-        batches = _batches([*single, *clusters], max(1, _MAX_TRACK_POINTS // (m.frames * m.sessions)))
+        batches = _batches([*single, *clusters], max(1, most // (m.frames * m.sessions)))
         return [_Clusters(m, batch, all_frames, couplings) for batch in batches]
     large = [cluster for cluster in clusters if len(cluster) > 2]
     pairs = [cluster for cluster in clusters if len(cluster) == 2]
