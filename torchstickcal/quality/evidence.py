@@ -24,6 +24,7 @@ from torchstickcal.pipeline.synchronise import ClockEstimate
 from torchstickcal.quality.acceptance import accepted
 from torchstickcal.quality.linear import FramePulls
 from torchstickcal.quality.moved import Motion, motion_of
+from torchstickcal.quality.single_points import slow_changes
 from torchstickcal.quality.verdict import Acceptance
 from torchstickcal.result import CameraParameter
 from torchstickcal.solvers.uncertainty import centre_covariances, relative_scale_std
@@ -293,7 +294,10 @@ class Evidence:
         if found is None or found.evidence < found.least:
             return found
         times = self._varying_times
-        return self._motion_among(times) if bool((times > 1).any()) else found
+        found = self._motion_among(times) if bool((times > 1).any()) else found
+        if found is None or found.evidence < found.least:
+            return found
+        return found.beside(*slow_changes(self.kept, self.state, self.ended.last.sigma_px, found, times))
 
     def _motion_among(self, times: Tensor) -> Motion | None:
         """The same, where of each point as many keypoints as ``times`` (P,) count as one."""

@@ -11,6 +11,7 @@ other three numbers of a change add more noise than evidence. They count only wh
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import torch
@@ -31,10 +32,11 @@ _EDGE = 0.04
 """Share of a session at each end in which no change is looked for: too few frames speak for it."""
 _BLOCKS = (12, 24, 48)
 """Numbers of blocks of frames from whose scatter the variance is estimated."""
-_LEAST_VARIANCE = 0.4
-"""Least variance of the pulls, over that of independent errors. The robust kernel makes it 0.55; of keypoints without noise
-only rounding errors are left."""
+_LEAST_VARIANCE, _VARIANCE_BY_KERNEL = 0.4, 0.55
+"""Least variance of the pulls, over that of independent errors, and what the robust kernel makes of it. Of keypoints without
+noise only rounding errors are left."""
 _CERTAIN = 0.95
+_LARGEST_EXPONENT = 50.0
 _NOT_A_TURN = 11.3
 """Evidence that a change has beyond a turn of the camera, from which on it was no turn: three more numbers have less by chance
 in 99 % of all sessions."""
@@ -63,6 +65,24 @@ class Motion(NamedTuple):
     """whether it went on during the whole session, rather than at once"""
     like_turn: bool
     """whether a turn explains it as well, which is then the change; a shift across the axis looks like a turn across it"""
+    variance: float
+    """of the pulls, over that of independent errors"""
+
+    def share(self, frames: int) -> Tensor:
+        """(F,), the share of the change that there is in each frame."""
+        return torch.linspace(-0.5, 0.5, frames) if self.gradual else (torch.arange(frames) >= self.frame).double()
+
+    def beside(self, variance: float, freedom: float) -> Motion:
+        """The same where errors of single points change slowly by themselves: with less evidence, and more that is needed.
+
+        Args:
+            variance: of their changes, over that of independent errors.
+            freedom: degrees of freedom of the estimate of this variance. What chance does for a known variance needs a larger
+                change where the variance is estimated, as the likelihood ratio says.
+        """
+        share = min(1.0, self.variance / (_VARIANCE_BY_KERNEL * variance))
+        least = max(freedom, 1.0) * math.expm1(min(_LARGEST_EXPONENT, LEAST_EVIDENCE / max(freedom, 1.0)))
+        return self._replace(evidence=share * self.evidence, rival=share * self.rival, least=max(self.least, least))
 
 
 def motion_of(pulls: FramePulls, rotations: Tensor, translations: Tensor) -> Motion | None:
@@ -95,6 +115,7 @@ def motion_of(pulls: FramePulls, rotations: Tensor, translations: Tensor) -> Mot
         tangent=tangent,
         gradual=best.gradual,
         like_turn=like_turn,
+        variance=best.variance,
     )
 
 

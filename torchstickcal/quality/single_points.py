@@ -1,0 +1,126 @@
+"""How much the errors of single points change slowly, by themselves, beside a change of a camera.
+
+When a camera moves, all its points agree on the change. Errors that depend on the view or on the pose of the athlete change
+too, each point by itself. Few points may happen to change as if their camera had moved. So a change of a camera is told from
+them only if it is larger than what single points do at any time of the session. The fewer points there are, the less is known
+of what they do, and the larger it has to be.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from torchstickcal.geometry import se3
+from torchstickcal.losses import ReprojectionLoss
+from torchstickcal.model.measurements import Measurements
+from torchstickcal.model.objective import Objective
+from torchstickcal.model.state import State
+from torchstickcal.quality.acceptance import Triangulated
+from torchstickcal.quality.moved import Motion
+
+_MOST_PARTS = 400
+"""Parts of a session of which the errors are kept apart. Longer sessions have several frames in a part."""
+_LEAST_FRAMES = 4
+"""Least number of frames before and after, for a change of a point to be known."""
+_OF_A_TRACK = 2.5
+"""Degrees of freedom of the squared changes of one track with independent errors, averaged over all frames: those of a Brownian
+bridge, ``(sum 1 / k^2)^2 / (sum 1 / k^4)``."""
+
+
+class SlowChanges(NamedTuple):
+    """Slow changes of the errors of single points.
+
+    A change is the difference between the mean errors of one point in one camera before and after some frame.
+    """
+
+    variance: float
+    """mean over all points, cameras and frames, over that of independent errors"""
+    freedom: float
+    """degrees of freedom of this mean; few where there are few points, or where few of them change"""
+
+
+def slow_changes(measurements: Measurements, state: State, sigma_px: Tensor, motion: Motion, times: Tensor) -> SlowChanges:
+    """The slow changes of single points beside the motion of a camera.
+
+    Args:
+        measurements: the inliers of one session.
+        state: the solution.
+        sigma_px: noise of each point's keypoints, (1, P), pixels.
+        motion: a change of a camera, which is taken out: as much of it as leaves the least changes.
+        times: (P,), as many keypoints of each point are counted as one.
+    """
+    sums = _Sums.of(measurements, state, sigma_px, motion)
+    count = sums.seen
+    total = count[:, :, -1:].clamp_min(1)
+    errors, by_motion = (own.cumsum(2) for own in (sums.errors, sums.by_motion))
+    errors, by_motion = (own - own[:, :, -1:] * count / total for own in (errors, by_motion))
+    amount = -(errors * by_motion).sum() / by_motion.square().sum().clamp_min(1e-12)
+    independent = count * (1 - count / total)
+    told = (count >= _LEAST_FRAMES) & (total - count >= _LEAST_FRAMES)
+    known = told.any(2).expand(-1, 2, -1)
+    if not bool(known.any()):
+        return SlowChanges(1.0, 0.0)
+    squared = ((errors + amount * by_motion).square() / independent.clamp_min(1)).where(told, 0.0)
+    changes = (squared.sum(2) / told.sum(2).clamp_min(1))[known]
+    variance = (sums.squares(float(amount)) / (total[:, :, 0] - 1).clamp_min(1))[known]
+    alike = changes.sum().square() / changes.square().sum().clamp_min(1e-12)
+    slow = (changes / times.expand_as(known)[known]).sum() / variance.sum().clamp_min(1e-12)
+    return SlowChanges(float(slow), float((_OF_A_TRACK + 2) * alike * sums.left_by_points))
+
+
+class _Sums(NamedTuple):
+    """Sums of the errors of K parts of a session, in standard deviations."""
+
+    errors: Tensor
+    """(C, 2, K, P), for the points that fit the keypoints best"""
+    by_motion: Tensor
+    """(C, 2, K, P), what the motion adds to them"""
+    seen: Tensor
+    """(C, 1, K, P), number of keypoints until the end of each part"""
+    products: Tensor
+    """(3, C, 2, P), sums over all frames of the squared errors, of errors times what the motion adds, and of this squared"""
+    left_by_points: float
+    """degrees of freedom of the keypoints when the points are fitted, as a share of all"""
+
+    @staticmethod
+    def of(m: Measurements, state: State, sigma_px: Tensor, motion: Motion) -> _Sums:
+        """By chunks of frames."""
+        rotations, translations = state.rotations.clone(), state.translations.clone()
+        moved = se3.retract(rotations[0, motion.camera], translations[0, motion.camera], motion.tangent)
+        rotations[0, motion.camera], translations[0, motion.camera] = moved
+        shifted = replace(state, rotations=rotations, translations=translations)
+        parts = min(m.frames, _MOST_PARTS)
+        part = torch.arange(m.frames, device=state.points.device) * parts // m.frames
+        share = motion.share(m.frames).to(state.points)
+        shape = m.num_cameras, 2, parts, m.points_per_frame
+        errors, by_motion, count = (state.points.new_zeros(*shape) for _ in range(3))
+        products = state.points.new_zeros(3, *shape[:2], shape[3])
+        for columns, frames in zip(m.chunks(), m.frame_slices(), strict=True):
+            chunk, seen = m.within(frames), m.by_frame(m.visible[0])[:, None, frames]
+            found, other = (_errors(chunk, own, columns, sigma_px).where(seen, 0.0) for own in (state, shifted))
+            added = share[frames, None] * (other - found)
+            errors.index_add_(2, part[frames], found)
+            by_motion.index_add_(2, part[frames], added)
+            count.index_add_(2, part[frames], seen.to(count).expand_as(found))
+            products += torch.stack([(one * two).sum(2) for one, two in ((found, found), (found, added), (added, added))])
+        views = m.visible[0].sum(0).double()
+        left = float((2 * views - 3).clamp_min(0).sum() / (2 * views).sum().clamp_min(1))
+        return _Sums(errors, by_motion, count[:, :1].cumsum(2), products, left)
+
+    def squares(self, amount: float) -> Tensor:
+        """(C, 2, P), sums of squares of what varies of the errors, when an amount of the motion is added."""
+        whole = self.products[0] + 2 * amount * self.products[1] + amount**2 * self.products[2]
+        mean = (self.errors + amount * self.by_motion).sum(2)
+        return whole - mean.square() / self.seen[:, :, -1].clamp_min(1)
+
+
+def _errors(chunk: Measurements, state: State, columns: slice, sigma_px: Tensor) -> Tensor:
+    """Residuals (C, 2, f, P) of a chunk in standard deviations, for the points that fit its keypoints best."""
+    own = replace(state, points=state.points[..., columns])
+    fitted = Triangulated.of(Objective(chunk, {"reprojection": ReprojectionLoss(sigma_px[:, None, None])}), own).points
+    residuals = torch.cat([r[0] for _, r, _ in chunk.residuals(replace(own, points=fitted[None]))], dim=-1).double()
+    return residuals.unflatten(-1, (-1, chunk.points_per_frame)) / sigma_px
