@@ -23,8 +23,8 @@ from torchstickcal.pipeline.check import CameraCheck
 from torchstickcal.pipeline.synchronise import ClockEstimate
 from torchstickcal.quality.acceptance import accepted
 from torchstickcal.quality.linear import FramePulls
-from torchstickcal.quality.moved import Motion, motion_of
-from torchstickcal.quality.single_points import slow_changes
+from torchstickcal.quality.moved import LEAST_EVIDENCE, Motion, motion_of
+from torchstickcal.quality.single_points import SlowChanges, estimated, slow_changes
 from torchstickcal.quality.verdict import Acceptance
 from torchstickcal.result import CameraParameter
 from torchstickcal.solvers.uncertainty import centre_covariances, relative_scale_std
@@ -297,7 +297,15 @@ class Evidence:
         found = self._motion_among(times) if bool((times > 1).any()) else found
         if found is None or found.evidence < found.least:
             return found
-        return found.beside(*slow_changes(self.kept, self.state, self.ended.last.sigma_px, found, times))
+        slow = slow_changes(self.kept, self.state, self.ended.last.sigma_px, found, times)
+        return found.beside(slow.variance, max(found.least, estimated(LEAST_EVIDENCE, slow.freedom)))
+
+    @cached_property
+    def slow_changes(self) -> SlowChanges:
+        """How much the errors of single points change slowly, beside a camera that moved."""
+        found = self.motion
+        motion = found if found is not None and found.evidence > found.least else None
+        return slow_changes(self.kept, self.state, self.ended.last.sigma_px, motion, self._varying_times)
 
     def _motion_among(self, times: Tensor) -> Motion | None:
         """The same, where of each point as many keypoints as ``times`` (P,) count as one."""

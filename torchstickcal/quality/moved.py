@@ -11,7 +11,6 @@ other three numbers of a change add more noise than evidence. They count only wh
 
 from __future__ import annotations
 
-import math
 from typing import NamedTuple
 
 import torch
@@ -36,7 +35,6 @@ _LEAST_VARIANCE, _VARIANCE_BY_KERNEL = 0.4, 0.55
 """Least variance of the pulls, over that of independent errors, and what the robust kernel makes of it. Of keypoints without
 noise only rounding errors are left."""
 _CERTAIN = 0.95
-_LARGEST_EXPONENT = 50.0
 _NOT_A_TURN = 11.3
 """Evidence that a change has beyond a turn of the camera, from which on it was no turn: three more numbers have less by chance
 in 99 % of all sessions."""
@@ -72,17 +70,15 @@ class Motion(NamedTuple):
         """(F,), the share of the change that there is in each frame."""
         return torch.linspace(-0.5, 0.5, frames) if self.gradual else (torch.arange(frames) >= self.frame).double()
 
-    def beside(self, variance: float, freedom: float) -> Motion:
-        """The same where errors of single points change slowly by themselves: with less evidence, and more that is needed.
+    def beside(self, slow_variance: float, least: float) -> Motion:
+        """The same with less evidence, where errors of single points change slowly by themselves.
 
         Args:
-            variance: of their changes, over that of independent errors.
-            freedom: degrees of freedom of the estimate of this variance. What chance does for a known variance needs a larger
-                change where the variance is estimated, as the likelihood ratio says.
+            slow_variance: of their changes, over that of independent errors.
+            least: evidence from which on it is a change.
         """
-        share = min(1.0, self.variance / (_VARIANCE_BY_KERNEL * variance))
-        least = max(freedom, 1.0) * math.expm1(min(_LARGEST_EXPONENT, LEAST_EVIDENCE / max(freedom, 1.0)))
-        return self._replace(evidence=share * self.evidence, rival=share * self.rival, least=max(self.least, least))
+        share = min(1.0, self.variance / (_VARIANCE_BY_KERNEL * slow_variance))
+        return self._replace(evidence=share * self.evidence, rival=share * self.rival, least=least)
 
 
 def motion_of(pulls: FramePulls, rotations: Tensor, translations: Tensor) -> Motion | None:

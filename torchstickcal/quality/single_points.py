@@ -8,6 +8,7 @@ of what they do, and the larger it has to be.
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -24,6 +25,7 @@ from torchstickcal.quality.moved import Motion
 
 _MOST_PARTS = 400
 """Parts of a session of which the errors are kept apart. Longer sessions have several frames in a part."""
+_LARGEST_EXPONENT = 50.0
 _LEAST_FRAMES = 4
 """Least number of frames before and after, for a change of a point to be known."""
 _OF_A_TRACK = 2.5
@@ -42,15 +44,32 @@ class SlowChanges(NamedTuple):
     freedom: float
     """degrees of freedom of this mean; few where there are few points, or where few of them change"""
 
+    def least(self, sigmas: float) -> float:
+        """Standard deviations by independent errors that are as unlikely as ``sigmas`` where errors change so slowly."""
+        return (max(1.0, self.variance) * estimated(sigmas**2, self.freedom)) ** 0.5
 
-def slow_changes(measurements: Measurements, state: State, sigma_px: Tensor, motion: Motion, times: Tensor) -> SlowChanges:
+
+def estimated(squared: float, freedom: float) -> float:
+    """Squared length in estimated standard deviations that is as unlikely as ``squared`` in known ones, by likelihood ratio.
+
+    Args:
+        squared: length in standard deviations, squared.
+        freedom: degrees of freedom of the estimate.
+    """
+    freedom = max(freedom, 1.0)
+    return freedom * math.expm1(min(squared / freedom, _LARGEST_EXPONENT))
+
+
+def slow_changes(
+    measurements: Measurements, state: State, sigma_px: Tensor, motion: Motion | None, times: Tensor
+) -> SlowChanges:
     """The slow changes of single points beside the motion of a camera.
 
     Args:
         measurements: the inliers of one session.
         state: the solution.
         sigma_px: noise of each point's keypoints, (1, P), pixels.
-        motion: a change of a camera, which is taken out: as much of it as leaves the least changes.
+        motion: a change of a camera, which is taken out: as much of it as leaves the least changes; None for none.
         times: (P,), as many keypoints of each point are counted as one.
     """
     sums = _Sums.of(measurements, state, sigma_px, motion)
@@ -87,21 +106,19 @@ class _Sums(NamedTuple):
     """degrees of freedom of the keypoints when the points are fitted, as a share of all"""
 
     @staticmethod
-    def of(m: Measurements, state: State, sigma_px: Tensor, motion: Motion) -> _Sums:
+    def of(m: Measurements, state: State, sigma_px: Tensor, motion: Motion | None) -> _Sums:
         """By chunks of frames."""
-        rotations, translations = state.rotations.clone(), state.translations.clone()
-        moved = se3.retract(rotations[0, motion.camera], translations[0, motion.camera], motion.tangent)
-        rotations[0, motion.camera], translations[0, motion.camera] = moved
-        shifted = replace(state, rotations=rotations, translations=translations)
+        shifted = state if motion is None else _moved(state, motion)
         parts = min(m.frames, _MOST_PARTS)
         part = torch.arange(m.frames, device=state.points.device) * parts // m.frames
-        share = motion.share(m.frames).to(state.points)
+        share = state.points.new_zeros(m.frames) if motion is None else motion.share(m.frames).to(state.points)
         shape = m.num_cameras, 2, parts, m.points_per_frame
         errors, by_motion, count = (state.points.new_zeros(*shape) for _ in range(3))
         products = state.points.new_zeros(3, *shape[:2], shape[3])
         for columns, frames in zip(m.chunks(), m.frame_slices(), strict=True):
             chunk, seen = m.within(frames), m.by_frame(m.visible[0])[:, None, frames]
-            found, other = (_errors(chunk, own, columns, sigma_px).where(seen, 0.0) for own in (state, shifted))
+            found = _errors(chunk, state, columns, sigma_px).where(seen, 0.0)
+            other = found if shifted is state else _errors(chunk, shifted, columns, sigma_px).where(seen, 0.0)
             added = share[frames, None] * (other - found)
             errors.index_add_(2, part[frames], found)
             by_motion.index_add_(2, part[frames], added)
@@ -116,6 +133,14 @@ class _Sums(NamedTuple):
         whole = self.products[0] + 2 * amount * self.products[1] + amount**2 * self.products[2]
         mean = (self.errors + amount * self.by_motion).sum(2)
         return whole - mean.square() / self.seen[:, :, -1].clamp_min(1)
+
+
+def _moved(state: State, motion: Motion) -> State:
+    """The state with a camera where it is after a motion."""
+    rotations, translations = state.rotations.clone(), state.translations.clone()
+    moved = se3.retract(rotations[0, motion.camera], translations[0, motion.camera], motion.tangent)
+    rotations[0, motion.camera], translations[0, motion.camera] = moved
+    return replace(state, rotations=rotations, translations=translations)
 
 
 def _errors(chunk: Measurements, state: State, columns: slice, sigma_px: Tensor) -> Tensor:
