@@ -24,7 +24,7 @@ from torchstickcal.pipeline.synchronise import ClockEstimate
 from torchstickcal.quality.acceptance import accepted
 from torchstickcal.quality.linear import FramePulls
 from torchstickcal.quality.moved import LEAST_EVIDENCE, Motion, motion_of
-from torchstickcal.quality.single_points import SlowChanges, estimated, slow_changes
+from torchstickcal.quality.single_points import Explanation, SlowChanges, estimated, slow_changes
 from torchstickcal.quality.verdict import Acceptance
 from torchstickcal.result import CameraParameter
 from torchstickcal.solvers.uncertainty import centre_covariances, relative_scale_std
@@ -297,15 +297,15 @@ class Evidence:
         found = self._motion_among(times) if bool((times > 1).any()) else found
         if found is None or found.evidence < found.least:
             return found
-        slow = slow_changes(self.kept, self.state, self.ended.last.sigma_px, found, times)
+        slow = self._slow_changes(Explanation.by_motion(self.kept, self.state, found))
         return found.beside(slow.variance, max(found.least, estimated(LEAST_EVIDENCE, slow.freedom)))
 
-    @cached_property
-    def slow_changes(self) -> SlowChanges:
-        """How much the errors of single points change slowly, beside a camera that moved."""
-        found = self.motion
-        motion = found if found is not None and found.evidence > found.least else None
-        return slow_changes(self.kept, self.state, self.ended.last.sigma_px, motion, self._varying_times)
+    def slow_changes_beside(self, camera: int, focal_factor: float) -> SlowChanges:
+        """How much the errors of single points change slowly, beside what another focal length of a camera explains."""
+        return self._slow_changes(Explanation.by_focal(self.kept, self.state, self.ended.last.sigma_px, camera, focal_factor))
+
+    def _slow_changes(self, explanation: Explanation) -> SlowChanges:
+        return slow_changes(self.kept, self.state, self.ended.last.sigma_px, self._varying_times, explanation)
 
     def _motion_among(self, times: Tensor) -> Motion | None:
         """The same, where of each point as many keypoints as ``times`` (P,) count as one."""

@@ -22,6 +22,7 @@ from torchstickcal.model.objective import Objective
 from torchstickcal.model.state import State
 from torchstickcal.quality.acceptance import Triangulated
 from torchstickcal.quality.moved import Motion
+from torchstickcal.quality.resection import resected
 
 _MOST_PARTS = 400
 """Parts of a session of which the errors are kept apart. Longer sessions have several frames in a part."""
@@ -60,30 +61,66 @@ def estimated(squared: float, freedom: float) -> float:
     return freedom * math.expm1(min(squared / freedom, _LARGEST_EXPONENT))
 
 
+class Explanation(NamedTuple):
+    """A session as it would be by what is doubted: a camera that moved, or another focal length."""
+
+    measurements: Measurements
+    """the inliers"""
+    state: State
+    share: Tensor
+    """(F,), how much of it there is in each frame"""
+
+    @staticmethod
+    def by_motion(measurements: Measurements, state: State, motion: Motion) -> Explanation:
+        """One camera moved."""
+        rotations, translations = state.rotations.clone(), state.translations.clone()
+        moved = se3.retract(rotations[0, motion.camera], translations[0, motion.camera], motion.tangent)
+        rotations[0, motion.camera], translations[0, motion.camera] = moved
+        moved_state = replace(state, rotations=rotations, translations=translations)
+        return Explanation(measurements, moved_state, motion.share(measurements.frames).to(state.points))
+
+    @staticmethod
+    def by_focal(measurements: Measurements, state: State, sigma_px: Tensor, camera: int, factor: float) -> Explanation:
+        """The focal length of one camera is larger by a factor; the camera is placed anew by the points."""
+        m, matrix = measurements, measurements.cameras.matrix.clone()
+        matrix[0, camera, :2, :2] *= factor
+        cameras = replace(m.cameras, matrix=matrix)
+        seen, pose = m.visible[0, camera], (state.rotations[0, camera], state.translations[0, camera])
+        sigma = sigma_px.expand(m.frames, -1).flatten()[seen]
+        placed = resected(
+            state.points[0][:, seen], m.pixels[0, camera][:, seen].double(), sigma, cameras[0][camera : camera + 1], start=pose
+        )
+        rotations, translations = state.rotations.clone(), state.translations.clone()
+        if placed is not None:
+            rotations[0, camera], translations[0, camera] = placed.rotation, placed.translation
+        other = replace(state, rotations=rotations, translations=translations)
+        return Explanation(replace(m, cameras=cameras), other, state.points.new_ones(m.frames))
+
+
 def slow_changes(
-    measurements: Measurements, state: State, sigma_px: Tensor, motion: Motion | None, times: Tensor
+    measurements: Measurements, state: State, sigma_px: Tensor, times: Tensor, explanation: Explanation | None = None
 ) -> SlowChanges:
-    """The slow changes of single points beside the motion of a camera.
+    """The slow changes of single points beside an explanation.
 
     Args:
         measurements: the inliers of one session.
         state: the solution.
         sigma_px: noise of each point's keypoints, (1, P), pixels.
-        motion: a change of a camera, which is taken out: as much of it as leaves the least changes; None for none.
         times: (P,), as many keypoints of each point are counted as one.
+        explanation: is taken out, as much of it as leaves the least changes; None for none.
     """
-    sums = _Sums.of(measurements, state, sigma_px, motion)
+    sums = _Sums.of(measurements, state, sigma_px, explanation)
     count = sums.seen
     total = count[:, :, -1:].clamp_min(1)
-    errors, by_motion = (own.cumsum(2) for own in (sums.errors, sums.by_motion))
-    errors, by_motion = (own - own[:, :, -1:] * count / total for own in (errors, by_motion))
-    amount = -(errors * by_motion).sum() / by_motion.square().sum().clamp_min(1e-12)
+    errors, added = (own.cumsum(2) for own in (sums.errors, sums.added))
+    errors, added = (own - own[:, :, -1:] * count / total for own in (errors, added))
+    amount = -(errors * added).sum() / added.square().sum().clamp_min(1e-12)
     independent = count * (1 - count / total)
     told = (count >= _LEAST_FRAMES) & (total - count >= _LEAST_FRAMES)
     known = told.any(2).expand(-1, 2, -1)
     if not bool(known.any()):
         return SlowChanges(1.0, 0.0)
-    squared = ((errors + amount * by_motion).square() / independent.clamp_min(1)).where(told, 0.0)
+    squared = ((errors + amount * added).square() / independent.clamp_min(1)).where(told, 0.0)
     changes = (squared.sum(2) / told.sum(2).clamp_min(1))[known]
     variance = (sums.squares(float(amount)) / (total[:, :, 0] - 1).clamp_min(1))[known]
     alike = changes.sum().square() / changes.square().sum().clamp_min(1e-12)
@@ -96,51 +133,43 @@ class _Sums(NamedTuple):
 
     errors: Tensor
     """(C, 2, K, P), for the points that fit the keypoints best"""
-    by_motion: Tensor
-    """(C, 2, K, P), what the motion adds to them"""
+    added: Tensor
+    """(C, 2, K, P), what the explanation adds to them"""
     seen: Tensor
     """(C, 1, K, P), number of keypoints until the end of each part"""
     products: Tensor
-    """(3, C, 2, P), sums over all frames of the squared errors, of errors times what the motion adds, and of this squared"""
+    """(3, C, 2, P), sums over all frames of the squared errors, of errors times what is added, and of this squared"""
     left_by_points: float
     """degrees of freedom of the keypoints when the points are fitted, as a share of all"""
 
     @staticmethod
-    def of(m: Measurements, state: State, sigma_px: Tensor, motion: Motion | None) -> _Sums:
+    def of(m: Measurements, state: State, sigma_px: Tensor, explanation: Explanation | None) -> _Sums:
         """By chunks of frames."""
-        shifted = state if motion is None else _moved(state, motion)
         parts = min(m.frames, _MOST_PARTS)
         part = torch.arange(m.frames, device=state.points.device) * parts // m.frames
-        share = state.points.new_zeros(m.frames) if motion is None else motion.share(m.frames).to(state.points)
         shape = m.num_cameras, 2, parts, m.points_per_frame
-        errors, by_motion, count = (state.points.new_zeros(*shape) for _ in range(3))
+        errors, added, count = (state.points.new_zeros(*shape) for _ in range(3))
         products = state.points.new_zeros(3, *shape[:2], shape[3])
         for columns, frames in zip(m.chunks(), m.frame_slices(), strict=True):
-            chunk, seen = m.within(frames), m.by_frame(m.visible[0])[:, None, frames]
-            found = _errors(chunk, state, columns, sigma_px).where(seen, 0.0)
-            other = found if shifted is state else _errors(chunk, shifted, columns, sigma_px).where(seen, 0.0)
-            added = share[frames, None] * (other - found)
-            errors.index_add_(2, part[frames], found)
-            by_motion.index_add_(2, part[frames], added)
-            count.index_add_(2, part[frames], seen.to(count).expand_as(found))
-            products += torch.stack([(one * two).sum(2) for one, two in ((found, found), (found, added), (added, added))])
+            seen = m.by_frame(m.visible[0])[:, None, frames]
+            own = _errors(m.within(frames), state, columns, sigma_px).where(seen, 0.0)
+            change = torch.zeros_like(own)
+            if explanation is not None:
+                other = _errors(explanation.measurements.within(frames), explanation.state, columns, sigma_px)
+                change = explanation.share[frames, None] * (other.where(seen, 0.0) - own)
+            errors.index_add_(2, part[frames], own)
+            added.index_add_(2, part[frames], change)
+            count.index_add_(2, part[frames], seen.to(count).expand_as(own))
+            products += torch.stack([(one * two).sum(2) for one, two in ((own, own), (own, change), (change, change))])
         views = m.visible[0].sum(0).double()
         left = float((2 * views - 3).clamp_min(0).sum() / (2 * views).sum().clamp_min(1))
-        return _Sums(errors, by_motion, count[:, :1].cumsum(2), products, left)
+        return _Sums(errors, added, count[:, :1].cumsum(2), products, left)
 
     def squares(self, amount: float) -> Tensor:
-        """(C, 2, P), sums of squares of what varies of the errors, when an amount of the motion is added."""
+        """(C, 2, P), sums of squares of what varies of the errors, when an amount of the explanation is added."""
         whole = self.products[0] + 2 * amount * self.products[1] + amount**2 * self.products[2]
-        mean = (self.errors + amount * self.by_motion).sum(2)
+        mean = (self.errors + amount * self.added).sum(2)
         return whole - mean.square() / self.seen[:, :, -1].clamp_min(1)
-
-
-def _moved(state: State, motion: Motion) -> State:
-    """The state with a camera where it is after a motion."""
-    rotations, translations = state.rotations.clone(), state.translations.clone()
-    moved = se3.retract(rotations[0, motion.camera], translations[0, motion.camera], motion.tangent)
-    rotations[0, motion.camera], translations[0, motion.camera] = moved
-    return replace(state, rotations=rotations, translations=translations)
 
 
 def _errors(chunk: Measurements, state: State, columns: slice, sigma_px: Tensor) -> Tensor:

@@ -121,8 +121,8 @@ def _contradicted(evidence: Evidence, unknown: CameraUnknown, parameter: CameraP
             value, std, limit = alone.value, alone.std, alone.limit
         if not abs(value - given) > max(limit * std, unknown.noticeable_prior_share * prior_std):
             continue
-        if not parameter.refined:
-            limit = evidence.slow_changes.least(limit)
+        if unknown.name == "focal" and not parameter.refined:
+            limit = evidence.slow_changes_beside(camera, value / given).least(limit)
             if not abs(value - given) > limit * std:
                 continue
         matters = not parameter.refined and _matters(evidence, unknown.name, value - given, given)
