@@ -22,6 +22,7 @@ from torchstickcal.pipeline.adjustment import Adjustment
 from torchstickcal.pipeline.check import CameraCheck
 from torchstickcal.pipeline.synchronise import ClockEstimate
 from torchstickcal.quality.acceptance import accepted
+from torchstickcal.quality.ends import ChangeAtEnd, change_at_end
 from torchstickcal.quality.linear import FramePulls
 from torchstickcal.quality.moved import LEAST_EVIDENCE, Motion, motion_of
 from torchstickcal.quality.single_points import Explanation, SlowChanges, estimated, slow_changes
@@ -161,6 +162,23 @@ class Evidence:
         runs = torch.stack([frames < count, frames >= other.shape[1] - count])
         at_end = (runs & other).sum(-1).amax(0) > _RUN_SHARE * count[:, 0]
         return at_end & (count[:, 0] >= _LEAST_RUN_SHARE * other.shape[1])
+
+    @cached_property
+    def changes_at_end(self) -> dict[int, ChangeAtEnd]:
+        """By camera, why its frames at an end of the session were set aside, where that is known."""
+        other, frames = self.ended.labels.other_person[0], self.ended.frames[0]
+        if not bool(other.any()) or frames.apart or self.measurements.frames != self.observations.num_frames:
+            return {}
+        found: dict[int, ChangeAtEnd] = {}
+        for camera in other.any(1).nonzero().flatten().tolist():
+            seen = (self.observations.visible & ~self.observations.at_corner)[camera]
+            keypoints = self.observations.keypoints[camera].double().where(seen[..., None], torch.nan)
+            pose = self.state.rotations[0, camera], self.state.translations[0, camera]
+            own = self.measurements.cameras[0][camera : camera + 1]
+            change = change_at_end(other[camera], self.points, keypoints, self.sigma_px, own, pose)
+            if change is not None:
+                found[camera] = change
+        return found
 
     @cached_property
     def in_common(self) -> Tensor:

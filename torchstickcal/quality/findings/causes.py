@@ -6,10 +6,9 @@ import math
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 
-from torchstickcal.geometry import se3
-from torchstickcal.metrics import rotation_angle
 from torchstickcal.quality.evidence import Evidence
 from torchstickcal.quality.finding import Finding, Severity
+from torchstickcal.quality.findings.motion import moved_far
 from torchstickcal.quality.registry import findings
 from torchstickcal.quality.resection import Resection
 from torchstickcal.quality.trials import (
@@ -36,8 +35,6 @@ _ALIEN_SHARE = 0.75
 """Share of a camera's keypoints that agree, over that of the others, below which it shows something else."""
 _IN_TIME_SHARE = 0.85
 """The same at another time, from which on the camera shows the same thing then: others do similar things at other times."""
-_FARTHEST_DEG, _FARTHEST_SHARE = 45.0, 0.3
-"""Largest change of a camera that is a motion of it, the shift as a share of the rig; beyond, it shows something else."""
 _MOST_SUSPECTS = 4
 _SHARE_OF_NOISE = 0.1
 """Share of agreeing keypoints that is worth as much as noise smaller by the factor e."""
@@ -117,7 +114,10 @@ def _explained(evidence: Evidence, camera: int, rest: Rest, agreement: float) ->
     if best is not None and not _explains(best[1], None if plain is None else plain[0]):
         best = None
     moved = moved_within(rest, sight) if as_given < _WHOLE_SHARE or best is not None else None
-    finding = None if moved is None else _moved(evidence, camera, *moved)
+    finding = None
+    if moved is not None:
+        before, after = ((place.rotation, place.translation) for place in moved[1:])
+        finding = moved_far(evidence, camera, moved[0], before, after)
     if best is not None and (moved is None or finding is None or not _closer(moved[1:], best[1])):
         hypothesis, placed = best
         return cause(hypothesis.code, hypothesis.what, hypothesis.advice, placed.share)
@@ -174,26 +174,6 @@ def _closer(places: Sequence[Resection], single: Resection) -> bool:
     """Whether a camera fits the others at two places as often as at one by another explanation, and clearly closer."""
     farthest, least = max(one.distance_sigmas for one in places), min(one.share for one in places)
     return least > single.share - _ALIKE and farthest < _CLOSER * single.distance_sigmas
-
-
-def _moved(evidence: Evidence, camera: int, frame: int, before: Resection, after: Resection) -> Finding | None:
-    name = evidence.camera(camera)
-    poses = [(one.rotation, one.translation) for one in (before, after)]
-    angle = float(rotation_angle(poses[1][0] @ poses[0][0].mT).rad2deg())
-    shift = float((se3.camera_centres(*poses[1]) - se3.camera_centres(*poses[0])).norm())
-    if angle > _FARTHEST_DEG or shift > _FARTHEST_SHARE * evidence.rig_m:
-        return None
-    return Finding(
-        "camera_moved",
-        Severity.SERIOUS,
-        f"{name} moved by {angle:.2g} degrees and {1000 * shift:.2g} mm between frames {frame - 1} and {frame} (± 2).",
-        "Calibrate the frames before and after it separately (Observations.with_camera_split).",
-        cameras=(name,),
-        frames=(frame, evidence.observations.num_frames - 1),
-        figure=angle,
-        unit="deg",
-        is_cause=True,
-    )
 
 
 def _of_a_pair(evidence: Evidence) -> Iterator[Finding]:
