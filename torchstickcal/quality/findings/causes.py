@@ -7,8 +7,8 @@ from collections.abc import Iterator, Sequence
 from dataclasses import replace
 
 from torchstickcal.quality.evidence import Evidence
+from torchstickcal.quality.far import moved_far
 from torchstickcal.quality.finding import Finding, Severity
-from torchstickcal.quality.findings.motion import moved_far
 from torchstickcal.quality.registry import findings
 from torchstickcal.quality.resection import Resection
 from torchstickcal.quality.trials import (

@@ -6,8 +6,8 @@ from collections.abc import Iterator
 
 from torchstickcal.quality.ends import ChangeAtEnd
 from torchstickcal.quality.evidence import Evidence
+from torchstickcal.quality.far import moved_far
 from torchstickcal.quality.finding import Finding, Severity
-from torchstickcal.quality.findings.motion import moved_far
 from torchstickcal.quality.registry import findings
 
 

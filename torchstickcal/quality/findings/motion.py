@@ -4,10 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from torch import Tensor
-
-from torchstickcal.geometry import se3
-from torchstickcal.metrics import rotation_angle
 from torchstickcal.quality.evidence import Evidence
 from torchstickcal.quality.finding import Finding, Severity
 from torchstickcal.quality.moved import Motion
@@ -17,8 +13,6 @@ _HARMLESS_DEG, _HARMLESS_SHARE = 0.2, 0.002
 """A change that is smaller than this angle, and this share of the rig, makes the cameras wrong by less than 1 %."""
 _LEAST_DRIFT = 150.0
 """Evidence of a drift. Errors of a detector that depend on where the athlete is look alike where he walks along a path."""
-_FARTHEST_DEG, _FARTHEST_SHARE = 45.0, 0.3
-"""Largest change of a camera that is a motion of it, the shift as a share of the rig; beyond, it shows something else."""
 _RIVAL_SHARE = 0.7
 """Evidence against another camera, as a share, from which on it is not certain which of both moved."""
 
@@ -62,37 +56,6 @@ def motion(evidence: Evidence) -> Iterator[Finding]:
         figure=found.evidence**0.5,
         limit=least**0.5,
         unit="standard deviations",
-        is_cause=True,
-    )
-
-
-def moved_far(
-    evidence: Evidence, camera: int, frame: int, before: tuple[Tensor, Tensor], after: tuple[Tensor, Tensor], note: str = ""
-) -> Finding | None:
-    """That a camera was at two places, rotation (3, 3) and translation (3,) each; None if they are farther apart than it moves.
-
-    Args:
-        evidence: of the session.
-        camera: which.
-        frame: the first one at the second place.
-        before: the first place.
-        after: the second.
-        note: what else is said.
-    """
-    name = evidence.camera(camera)
-    angle = float(rotation_angle(after[0] @ before[0].mT).rad2deg())
-    shift = float((se3.camera_centres(*after) - se3.camera_centres(*before)).norm())
-    if angle > _FARTHEST_DEG or shift > _FARTHEST_SHARE * evidence.rig_m:
-        return None
-    return Finding(
-        "camera_moved",
-        Severity.SERIOUS,
-        f"{name} moved by {angle:.2g} degrees and {1000 * shift:.2g} mm between frames {frame - 1} and {frame} (± 2){note}.",
-        "Calibrate the frames before and after it separately (Observations.with_camera_split).",
-        cameras=(name,),
-        frames=(frame, evidence.observations.num_frames - 1),
-        figure=angle,
-        unit="deg",
         is_cause=True,
     )
 
