@@ -36,8 +36,8 @@ def _judged(evidence: Evidence) -> Quality:
     if _worth_trying(evidence, found):
         causes = [finding for family in FAMILIES.values() if family.tries for finding in _findings(family, evidence)]
     if any(finding.is_cause for finding in causes):
-        large = list(_as_effects(found))
-    return Quality.of([*causes, *large, *([] if causes else small)], _acceptance(evidence))
+        large, small = list(_as_effects(found)), []
+    return Quality.of([*causes, *large, *small], _acceptance(evidence))
 
 
 def _worth_trying(evidence: Evidence, found: dict[Family, list[Finding]]) -> bool:
