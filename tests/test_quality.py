@@ -176,6 +176,7 @@ def test_errors_that_stay_are_no_motion_of_a_camera(seed: int):
         (0.05, 3.3, 0.2, 8, 1.0, False),
         (0.05, 3.5, 0.2, 3, 2.0, False),
         (0.05, 8.0, 0.2, 8, 2.0, True),
+        (0.18, 3.7, 0.9, 6, 1.0, True),
     ],
 )
 def test_a_large_error_of_a_focal_length_needs_less_evidence(
@@ -447,11 +448,13 @@ def test_errors_that_depend_on_the_view_of_few_points_are_no_motion_of_a_camera(
     assert not {"camera_moved", "camera_drifted", "focal_contradicted"} & set(codes(quality))
 
 
-@pytest.mark.parametrize(("sport", "cameras", "error"), [("baseball", 4, 1.0), ("kendo", 5, 0.0)])
-def test_a_camera_that_moved_is_found_by_two_balls(sport: str, cameras: int, error: float):
+@pytest.mark.parametrize(
+    ("sport", "cameras", "error", "step_px"), [("baseball", 4, 1.0, 1.0), ("kendo", 5, 0.0, 0.5), ("golf", 4, 1.0, 3.0)]
+)
+def test_a_camera_that_moved_is_found_by_two_balls(sport: str, cameras: int, error: float, step_px: float):
     observations = two_balls(sport, cameras, 2, error)
     keypoints = observations.keypoints.clone()
-    keypoints[1, 70:, :, 0] += 3.0
+    keypoints[1, 70:, :, 0] += step_px
     quality = calibrate(replace(observations, keypoints=keypoints)).quality
     (found,) = [finding for finding in quality.findings if finding.code == "camera_moved"]
     assert found.cameras == ("cam02",)

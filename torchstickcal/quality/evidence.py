@@ -37,7 +37,7 @@ DOUBTFUL_SHARE = 0.78
 """Share of a camera's keypoints that agree, below which it is doubted where the other cameras have more."""
 _NEAR_FOCAL = 0.3
 """Logarithm of an estimated or suggested over the given focal length: from here on, something else is wrong."""
-_FAR_SIGMAS = 8.0
+_FAR_SIGMAS = 5.0
 _MOST_SHARE, _MOST_PLACES, _OUTSIDE = (0.05, 0.95), 20_000, 1.2
 """Quantiles of the keypoints between which the rest are wrong ones, the number of keypoints that is looked at, and the distance
 from the principal point, over its own from the corner of the image, beyond which there is no image."""

@@ -28,8 +28,9 @@ _SOUND_SHARE, _GAIN, _CLEAR_GAIN = 0.6, 0.15, 0.08
 where it is nearly right."""
 _ALIKE, _ALIKE_DISTANCE = 0.05, 1.15
 """Difference of shares, and ratio of distances, up to which the simpler of two explanations is the one."""
-_CLOSER = 0.8
-"""Ratio of distances from which on an explanation with an equal share is better than none."""
+_CLOSER, _CLOSER_IF_WRONG = 0.8, 0.9
+"""Ratio of distances from which on an explanation with an equal share is better than none: of any camera, and of one whose
+intrinsics are surely not as given."""
 _WHOLE_SHARE = 0.8
 _ALIEN_SHARE = 0.75
 """Share of a camera's keypoints that agree, over that of the others, below which it shows something else."""
@@ -111,7 +112,7 @@ def _explained(evidence: Evidence, camera: int, rest: Rest, agreement: float) ->
 
     found = [(h, placed[0]) for h in hypotheses() if (placed := rest.placed(h.changed(sight))) is not None]
     best = _best(found)
-    if best is not None and not _explains(best[1], None if plain is None else plain[0]):
+    if best is not None and not _explains(best[1], None if plain is None else plain[0], bool(evidence.absurd_focals[camera])):
         best = None
     moved = moved_within(rest, sight) if as_given < _WHOLE_SHARE or best is not None else None
     finding = None
@@ -161,11 +162,18 @@ def _best(found: list[tuple[Hypothesis, Resection]]) -> tuple[Hypothesis, Resect
     return next((one for one in alike if one[1].distance_sigmas <= _ALIKE_DISTANCE * least), None)
 
 
-def _explains(placed: Resection, plain: Resection | None) -> bool:
-    """Whether a camera as it would be by an explanation fits the others clearly better than as given."""
+def _explains(placed: Resection, plain: Resection | None, surely_wrong: bool) -> bool:
+    """Whether a camera as it would be by an explanation fits the others clearly better than as given.
+
+    Args:
+        placed: by the explanation.
+        plain: as given.
+        surely_wrong: whether its intrinsics are surely not as given.
+    """
     if placed.share < _SOUND_SHARE or placed.distance_sigmas > _NEAR_SIGMAS or plain is None:
         return placed.share > _SOUND_SHARE and placed.distance_sigmas < _NEAR_SIGMAS
-    closer = placed.share > plain.share - _ALIKE and placed.distance_sigmas < _CLOSER * plain.distance_sigmas
+    ratio = _CLOSER_IF_WRONG if surely_wrong else _CLOSER
+    closer = placed.share > plain.share - _ALIKE and placed.distance_sigmas < ratio * plain.distance_sigmas
     gain = _GAIN if plain.share < _SOUND_SHARE else _CLEAR_GAIN
     return closer or placed.share > plain.share + gain
 

@@ -31,6 +31,8 @@ _FAR_FOCAL, _FAR_SIGMAS, _FAR_BY_CHANCE = 0.03, 3.0, 0.005
 """Error of a focal length that no careful calibration makes, from which on less evidence is enough, where the errors of the
 keypoints are not always the same: for the common factor of all cameras, in standard deviations; for the most doubtful of all
 cameras, as the share of sound sessions in which chance reaches it."""
+_BIASED_FOCAL = 0.1
+"""The same where they are: biased keypoints alone make 1 to 2 %, and a wrong focal length makes such errors too."""
 _UNSEEN_FOCAL = 0.05
 """Error of all focal lengths from which on it is said that the keypoints would not show it."""
 _IN_STEP_FRAMES = 0.15
@@ -161,12 +163,13 @@ class _Alone(NamedTuple):
 
 def _far_alone(evidence: Evidence) -> _Alone | None:
     """The focal length that is the most doubtful by itself; None unless it is as wrong as no careful calibration makes it."""
-    if evidence.check is None or evidence.constant_errors_sigmas >= CONSTANT_SIGMAS:
+    if evidence.check is None:
         return None
     values, stds = (own[:, 0] for own in evidence.check.suggestion_of_one("focal"))
     camera = int((values / stds).abs().nan_to_num(0.0).argmax())
     change, given = float(values[camera].expm1()), float(evidence.unknowns["focal"].given[camera])
-    if not abs(change) > _FAR_FOCAL:
+    biased = evidence.constant_errors_sigmas >= CONSTANT_SIGMAS
+    if not abs(change) > (_BIASED_FOCAL if biased else _FAR_FOCAL):
         return None
     limit = torch.special.ndtri(torch.tensor(1 - _FAR_BY_CHANCE / (2 * evidence.cameras), dtype=torch.float64))
     return _Alone(camera, given * (1 + change), given * float(stds[camera]), float(limit))
