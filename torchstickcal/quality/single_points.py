@@ -16,17 +16,21 @@ import torch
 from torch import Tensor
 
 from torchstickcal.geometry import se3
+from torchstickcal.geometry.symmetric import IDENTITY, solve
 from torchstickcal.losses import ReprojectionLoss
 from torchstickcal.model.measurements import Measurements
 from torchstickcal.model.objective import Objective
 from torchstickcal.model.state import State
-from torchstickcal.quality.acceptance import Triangulated
 from torchstickcal.quality.moved import Motion
 from torchstickcal.quality.resection import resected
 
 _MOST_PARTS = 400
 """Parts of a session of which the errors are kept apart. Longer sessions have several frames in a part."""
 _LARGEST_EXPONENT = 50.0
+_DAMPING = 1e-3
+"""Of a point's step, over its information: keeps it near where it is along a direction in which its keypoints hardly change."""
+_DIAGONAL = [0, 3, 5]
+"""The entries xx, yy and zz of symmetric matrices."""
 _LEAST_FRAMES = 4
 """Least number of frames before and after, for a change of a point to be known."""
 _OF_A_TRACK = 2.5
@@ -173,8 +177,13 @@ class _Sums(NamedTuple):
 
 
 def _errors(chunk: Measurements, state: State, columns: slice, sigma_px: Tensor) -> Tensor:
-    """Residuals (C, 2, f, P) of a chunk in standard deviations, for the points that fit its keypoints best."""
+    """Residuals (C, 2, f, P) of a chunk in standard deviations, for the points that fit its keypoints best, near the state."""
     own = replace(state, points=state.points[..., columns])
-    fitted = Triangulated.of(Objective(chunk, {"reprojection": ReprojectionLoss(sigma_px[:, None, None])}), own).points
-    residuals = torch.cat([r[0] for _, r, _ in chunk.residuals(replace(own, points=fitted[None]))], dim=-1).double()
+    objective = Objective(chunk, {"reprojection": ReprojectionLoss(sigma_px[:, None, None])})
+    terms = objective.linearise_chunk(own, slice(0, chunk.num_columns), by_unknowns=False)["reprojection"]
+    information, gradient = terms.hessian[0].double().sum(0), terms.gradient[0].double().sum(0)
+    information = information + _DAMPING * information[_DIAGONAL].sum(0) * information.new_tensor(IDENTITY)[:, None]
+    step = solve(information.where(chunk.active[0], information.new_tensor(IDENTITY)[:, None]), gradient)
+    fitted = replace(own, points=(own.points[0] - step.where(chunk.active[0], 0.0))[None])
+    residuals = torch.cat([residual[0] for _, residual, _ in chunk.residuals(fitted)], dim=-1).double()
     return residuals.unflatten(-1, (-1, chunk.points_per_frame)) / sigma_px
