@@ -23,6 +23,7 @@ from torchstickcal.errors import ObservationError
 from torchstickcal.geometry import se3
 from torchstickcal.io import load_session, write_npz
 from torchstickcal.model.unknowns import all_unknowns
+from torchstickcal.quality.ends import change_at_end
 from torchstickcal.quality.evidence import Evidence, without_depth
 from torchstickcal.quality.findings.causes import _closer
 from torchstickcal.quality.findings.unknowns import _all_focals, _contradicted, _different, _little_in_common
@@ -32,6 +33,7 @@ from torchstickcal.quality.linear import FramePulls
 from torchstickcal.quality.moved import motion_of
 from torchstickcal.quality.registry import FAMILIES, Family, findings
 from torchstickcal.quality.resection import Resection, resected
+from torchstickcal.quality.single_points import SlowChanges, estimated
 from torchstickcal.quality.trials import without
 from torchstickcal.result import CameraParameter
 from torchstickcal.simulate import Noise, SessionSpec, SimulatedSession, golf_session
@@ -234,23 +236,34 @@ def test_errors_that_stay_are_no_motion_of_a_camera(seed: int):
 
 
 @pytest.mark.parametrize(
-    ("share", "sigmas", "constant", "said"),
+    ("share", "sigmas", "constant", "cameras", "slow", "said"),
     [
-        (0.05, 3.5, 0.2, True),
-        (0.05, 3.5, 0.8, False),
-        (0.025, 3.5, 0.2, False),
-        (0.025, 4.5, 0.8, True),
-        (0.05, 2.5, 0.2, False),
+        (0.05, 3.5, 0.2, 3, 1.0, True),
+        (0.05, 3.5, 0.8, 3, 1.0, False),
+        (0.025, 3.5, 0.2, 3, 1.0, False),
+        (0.025, 4.5, 0.8, 3, 1.0, True),
+        (0.05, 2.5, 0.2, 3, 1.0, False),
+        (0.05, 3.3, 0.2, 3, 1.0, True),
+        (0.05, 3.3, 0.2, 8, 1.0, False),
+        (0.05, 3.5, 0.2, 3, 2.0, False),
+        (0.05, 8.0, 0.2, 8, 2.0, True),
+        (0.18, 3.7, 0.9, 6, 1.0, True),
     ],
 )
-def test_a_large_error_of_a_focal_length_needs_less_evidence(share: float, sigmas: float, constant: float, said: bool):
-    given, deviation = torch.full((3,), 1200.0), 1200 * torch.tensor([0.0, share, 0.0])
-    focal = CameraParameter(
-        *("focal length", "px", ("focal",), False), given, given, given, 0.1 * given,
-        (given + deviation, torch.full((3,), 1200 * share / sigmas)),
-    )  # fmt: skip
+def test_a_large_error_of_a_focal_length_needs_less_evidence(
+    share: float, sigmas: float, constant: float, cameras: int, slow: float, said: bool
+):
+    """The more cameras are looked at, and the more single points change by themselves, the more."""
+    given, change = torch.full((cameras,), 1200.0), share * torch.eye(cameras)[1]
+    std = torch.full((cameras,), share / sigmas)
+    suggested = (given * (1 + change), 1200 * std)
+    focal = CameraParameter("focal length", "px", ("focal",), False, given, given, given, 0.1 * given, suggested)
     evidence = SimpleNamespace(
         observations=session(cameras=3, frames=2).observations,
+        cameras=cameras,
+        check=SimpleNamespace(suggestion_of_one=lambda name: (change.log1p()[:, None], std[:, None])),
+        unknowns={"focal": focal},
+        slow_changes_beside=lambda camera, factor: SlowChanges(slow, 1000.0),
         constant_errors_sigmas=constant,
         camera=lambda camera: f"cam{camera}",
         explains_most=lambda family: True,
@@ -427,15 +440,97 @@ def test_errors_that_last_are_no_motion_of_a_camera(seed: int):
     assert "camera_moved" not in codes(calibration.quality)
 
 
-@pytest.mark.parametrize(("camera", "first", "turn_deg"), [(2, 11, 4.0), (1, 14, 3.0)])
-def test_a_camera_that_moved_far_near_an_end_is_no_other_person(camera: int, first: int, turn_deg: float):
+@pytest.mark.parametrize(
+    ("camera", "first", "turn_deg", "shift_m"), [(2, 11, 4.0, 0.0), (1, 14, 3.0, 0.0), (0, 54, 12.0, 0.4), (3, 5, 20.0, 0.1)]
+)
+def test_a_camera_that_moved_far_near_an_end_is_no_other_person(camera: int, first: int, turn_deg: float, shift_m: float):
     """All its keypoints contradict the others on one side of the move, and are set aside."""
-    calibration = calibrate(knocked(session(), camera, first, turn_deg, 0.0))
-    assert int(calibration.other_person[camera].sum()) >= first - 2
+    calibration = calibrate(knocked(session(), camera, first, turn_deg, shift_m))
+    assert int(calibration.other_person[camera].sum()) >= min(first, 60 - first) - 2
     found = calibration.quality.findings[0]
     assert (found.code, found.cameras) == ("camera_moved", (f"cam{camera + 1:02d}",))
     assert found.frames is not None
     assert abs(found.frames[0] - first) <= 2
+    assert found.figure == pytest.approx(turn_deg, abs=1.0)
+    assert "other_person" not in codes(calibration.quality)
+
+
+@pytest.mark.parametrize(("camera", "first"), [(1, 50), (2, 8)])
+def test_another_person_near_an_end_is_no_camera_that_moved(camera: int, first: int):
+    given = session()
+    other = session("kendo", seed=9).observations.keypoints[camera, :, :17] + 120.0
+    keypoints = given.observations.keypoints.clone()
+    wrong = slice(first, None) if first > 30 else slice(0, first)
+    keypoints[camera, wrong, :17] = other[wrong].to(keypoints)
+    quality = calibrate(replace(given.observations, keypoints=keypoints)).quality
+    assert "camera_moved" not in codes(quality)
+    assert "other_person" in codes(quality)
+
+
+@pytest.mark.parametrize(("later", "first"), [(9, 70), (-7, 40)])
+def test_frames_at_an_end_that_belong_to_another_time(later: int, first: int):
+    """Frames that were lost, or recorded twice: the camera did not move, its frames are those of other times."""
+    given = session(frames=100, seed=3)
+    points, keypoints = given.truth.points, given.observations.keypoints[1].double()
+    assert points is not None
+    set_aside = torch.arange(100) >= first
+    shifted = torch.where(set_aside[:, None, None], keypoints.roll(-later, 0), keypoints)
+    shifted[len(shifted) - max(later, 0) :] = torch.nan
+    pose = given.truth.rotations[1].double(), given.truth.translations[1].double()
+    sigma_px = torch.full((points.shape[1],), 1.5, dtype=torch.float64)
+    camera = given.observations.cameras[1:2]
+    change = change_at_end(set_aside, points.double().permute(2, 0, 1), shifted, sigma_px, camera, pose)
+    assert change is not None
+    assert (change.frame, change.at_start, change.later) == (first, False, later)
+    assert change_at_end(~set_aside & set_aside, points.double().permute(2, 0, 1), shifted, sigma_px, camera, pose) is None
+
+
+@pytest.mark.parametrize(("squared", "freedom", "expected"), [(24.0, 1e6, 24.0), (24.0, 25.0, 40.3), (16.0, 100.0, 17.4)])
+def test_a_squared_length_in_estimated_standard_deviations(squared: float, freedom: float, expected: float):
+    assert estimated(squared, freedom) == pytest.approx(expected, rel=0.01)
+
+
+def two_balls(sport: str, cameras: int, seed: int, error: float) -> Observations:
+    """A stick whose ends are marked with balls, and no athlete. One end is seen off along the stick, as its view has it."""
+    given = SessionSpec("balls", sport, seed, cameras, 120, fps=120, regimes=(Noise(0.12),)).generate()
+    points = given.truth.points
+    assert points is not None
+    start, end = given.observations.sticks[0].ends
+    ends = points[:, [start, end]].double()
+    rotations, translations = given.truth.rotations.double(), given.truth.translations.double()
+    in_camera = torch.einsum("cij,fpj->cfpi", rotations, ends) + translations[:, None, None]
+    along, view = in_camera[:, :, 1] - in_camera[:, :, 0], in_camera.mean(2)
+    slant = torch.nn.functional.cosine_similarity(along, view, dim=-1).abs()
+    keypoints = given.observations.keypoints[:, :, [start, end]].double()
+    direction = torch.nn.functional.normalize(keypoints[:, :, 1] - keypoints[:, :, 0], dim=-1)
+    keypoints[:, :, 0] += error * torch.where(slant > 0.8, 0.3, torch.where(slant > 0.3, 0.1, 0.02))[..., None] * direction
+    stick = replace(given.observations.sticks[0], start=0, end=1)
+    return Observations(keypoints, given.observations.intrinsics, stick, image_size=given.observations.image_size, fps=120)
+
+
+@pytest.mark.parametrize(
+    ("sport", "cameras", "seed", "error"),
+    [("baseball", 4, 1, 1.0), ("hockey", 4, 6, 1.0), ("baseball", 4, 13, 1.0), ("hockey", 3, 18, 1.0), ("golf", 6, 8, 3.0)],
+)
+def test_errors_that_depend_on_the_view_of_few_points_are_no_motion_of_a_camera(
+    sport: str, cameras: int, seed: int, error: float
+):
+    quality = calibrate(two_balls(sport, cameras, seed, error)).quality
+    assert not {"camera_moved", "camera_drifted", "focal_contradicted"} & set(codes(quality))
+
+
+@pytest.mark.parametrize(
+    ("sport", "cameras", "error", "step_px"), [("baseball", 4, 1.0, 1.0), ("kendo", 5, 0.0, 0.5), ("golf", 4, 1.0, 3.0)]
+)
+def test_a_camera_that_moved_is_found_by_two_balls(sport: str, cameras: int, error: float, step_px: float):
+    observations = two_balls(sport, cameras, 2, error)
+    keypoints = observations.keypoints.clone()
+    keypoints[1, 70:, :, 0] += step_px
+    quality = calibrate(replace(observations, keypoints=keypoints)).quality
+    (found,) = [finding for finding in quality.findings if finding.code == "camera_moved"]
+    assert found.cameras == ("camera 1",)
+    assert found.frames is not None
+    assert abs(found.frames[0] - 70) <= 2
 
 
 @pytest.mark.parametrize(

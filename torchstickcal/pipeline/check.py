@@ -127,8 +127,16 @@ class CameraCheck:
     @cached_property
     def _suggestions(self) -> dict[str, Suggestion]:
         """For each unknown, as if there were no other: by the blocks on the diagonal of the system of all."""
+        columns = self._system.every.columns.values()
+        return self._suggested(torch.cat([torch.full_like(own, number) for number, own in enumerate(columns)]))
+
+    def suggestion_of_one(self, name: str) -> Suggestion:
+        """What the keypoints suggest for an unknown of each camera, as if it were that of this camera alone."""
+        return self._suggested(torch.arange(self._system.every.count, device=self._system.gradient.device))[name]
+
+    def _suggested(self, block: Tensor) -> dict[str, Suggestion]:
+        """What is suggested where the unknowns of one block (K,) are unknown together, the others as given."""
         every, (information, gradient, gradient_covariance) = self._system.every, self._without_poses
-        block = torch.cat([torch.full_like(columns, number) for number, columns in enumerate(every.columns.values())])
         alone = information.where(block == block[:, None], 0.0)
         values, covariance = -solve_information(alone, gradient), covariance_of(alone)
         if gradient_covariance is not None:

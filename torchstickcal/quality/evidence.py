@@ -23,8 +23,10 @@ from torchstickcal.pipeline.adjustment import Adjustment
 from torchstickcal.pipeline.check import CameraCheck
 from torchstickcal.pipeline.synchronise import ClockEstimate
 from torchstickcal.quality.acceptance import accepted
+from torchstickcal.quality.ends import ChangeAtEnd, change_at_end
 from torchstickcal.quality.linear import FramePulls
-from torchstickcal.quality.moved import Motion, motion_of
+from torchstickcal.quality.moved import LEAST_EVIDENCE, Motion, motion_of
+from torchstickcal.quality.single_points import Explanation, SlowChanges, estimated, slow_changes
 from torchstickcal.quality.verdict import Acceptance
 from torchstickcal.result import CameraParameter
 from torchstickcal.solvers.uncertainty import centre_covariances, relative_scale_std
@@ -40,7 +42,7 @@ frame to frame, beyond that of the median camera, above which it shows something
 differ by 0.1 at most. Mirrored and alien ones that fit at another place have 0.87 and less, and differ by 0.4 and more."""
 _NEAR_FOCAL = 0.3
 """Logarithm of an estimated or suggested over the given focal length: from here on, something else is wrong."""
-_FAR_SIGMAS = 8.0
+_FAR_SIGMAS = 5.0
 _MOST_SHARE, _MOST_PLACES, _OUTSIDE = (0.05, 0.95), 20_000, 1.2
 """Quantiles of the keypoints between which the rest are wrong ones, the number of keypoints that is looked at, and the distance
 from the principal point, over its own from the corner of the image, beyond which there is no image."""
@@ -188,6 +190,23 @@ class Evidence:
         return at_end & (count[:, 0] >= _LEAST_RUN_SHARE * other.shape[1])
 
     @cached_property
+    def changes_at_end(self) -> dict[int, ChangeAtEnd]:
+        """By camera, why its frames at an end of the session were set aside, where that is known."""
+        other, frames = self.ended.labels.other_person[0], self.ended.frames[0]
+        if not bool(other.any()) or frames.apart or self.measurements.frames != self.observations.num_frames:
+            return {}
+        found: dict[int, ChangeAtEnd] = {}
+        for camera in other.any(1).nonzero().flatten().tolist():
+            seen = (self.observations.visible & ~self.observations.at_corner)[camera]
+            keypoints = self.observations.keypoints[camera].double().where(seen[..., None], torch.nan)
+            pose = self.state.rotations[0, camera], self.state.translations[0, camera]
+            own = self.measurements.cameras[0][camera : camera + 1]
+            change = change_at_end(other[camera], self.points, keypoints, self.sigma_px, own, pose)
+            if change is not None:
+                found[camera] = change
+        return found
+
+    @cached_property
     def in_common(self) -> Tensor:
         """(C,), share of each camera's keypoints that another camera sees at the same time; 1 where it has none. Of a camera
         that has more than others, as many count."""
@@ -319,7 +338,18 @@ class Evidence:
         if found is None or found.evidence < found.least:
             return found
         times = self._varying_times
-        return self._motion_among(times) if bool((times > 1).any()) else found
+        found = self._motion_among(times) if bool((times > 1).any()) else found
+        if found is None or found.evidence < found.least:
+            return found
+        slow = self._slow_changes(Explanation.by_motion(self.kept, self.state, found))
+        return found.beside(slow.variance, max(found.least, estimated(LEAST_EVIDENCE, slow.freedom)))
+
+    def slow_changes_beside(self, camera: int, focal_factor: float) -> SlowChanges:
+        """How much the errors of single points change slowly, beside what another focal length of a camera explains."""
+        return self._slow_changes(Explanation.by_focal(self.kept, self.state, self.ended.last.sigma_px, camera, focal_factor))
+
+    def _slow_changes(self, explanation: Explanation) -> SlowChanges:
+        return slow_changes(self.kept, self.state, self.ended.last.sigma_px, self._varying_times, explanation)
 
     def _motion_among(self, times: Tensor) -> Motion | None:
         """The same, where of each point as many keypoints as ``times`` (P,) count as one."""

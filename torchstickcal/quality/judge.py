@@ -42,13 +42,14 @@ def _judged(evidence: Evidence) -> Quality:
     if _worth_trying(evidence, found):
         causes = [finding for family in FAMILIES.values() if family.tries for finding in _findings(family, evidence)]
     if any(finding.is_cause for finding in causes):
-        large = list(_as_effects(found))
-    return Quality.of([*causes, *large, *([] if causes else small)], _acceptance(evidence))
+        large, small = list(_as_effects(found)), []
+    return Quality.of([*causes, *large, *small], _acceptance(evidence))
 
 
 def _worth_trying(evidence: Evidence, found: dict[Family, list[Finding]]) -> bool:
     """Whether something is wrong, or may be, that no finding explains."""
-    if bool((evidence.off_centre | evidence.set_aside_at_end | evidence.misfits).any()):
+    unexplained = evidence.off_centre | evidence.set_aside_at_end | evidence.misfits
+    if any(camera not in evidence.changes_at_end for camera in unexplained.nonzero().flatten().tolist()):
         return True
     every = [finding for own in found.values() for finding in own]
     wrong = any(finding.severity >= Severity.SERIOUS or finding.code == "camera_doubtful" for finding in every)

@@ -31,9 +31,9 @@ _EDGE = 0.04
 """Share of a session at each end in which no change is looked for: too few frames speak for it."""
 _BLOCKS = (12, 24, 48)
 """Numbers of blocks of frames from whose scatter the variance is estimated."""
-_LEAST_VARIANCE = 0.4
-"""Least variance of the pulls, over that of independent errors. The robust kernel makes it 0.55; of keypoints without noise
-only rounding errors are left."""
+_LEAST_VARIANCE, _VARIANCE_BY_KERNEL = 0.4, 0.55
+"""Least variance of the pulls, over that of independent errors, and what the robust kernel makes of it. Of keypoints without
+noise only rounding errors are left."""
 _CERTAIN = 0.95
 _NOT_A_TURN = 11.3
 """Evidence that a change has beyond a turn of the camera, from which on it was no turn: three more numbers have less by chance
@@ -63,6 +63,22 @@ class Motion(NamedTuple):
     """whether it went on during the whole session, rather than at once"""
     like_turn: bool
     """whether a turn explains it as well, which is then the change; a shift across the axis looks like a turn across it"""
+    variance: float
+    """of the pulls, over that of independent errors"""
+
+    def share(self, frames: int) -> Tensor:
+        """(F,), the share of the change that there is in each frame."""
+        return torch.linspace(-0.5, 0.5, frames) if self.gradual else (torch.arange(frames) >= self.frame).double()
+
+    def beside(self, slow_variance: float, least: float) -> Motion:
+        """The same with less evidence, where errors of single points change slowly by themselves.
+
+        Args:
+            slow_variance: of their changes, over that of independent errors.
+            least: evidence from which on it is a change.
+        """
+        share = min(1.0, self.variance / (_VARIANCE_BY_KERNEL * slow_variance))
+        return self._replace(evidence=share * self.evidence, rival=share * self.rival, least=least)
 
 
 def motion_of(pulls: FramePulls, rotations: Tensor, translations: Tensor) -> Motion | None:
@@ -95,6 +111,7 @@ def motion_of(pulls: FramePulls, rotations: Tensor, translations: Tensor) -> Mot
         tangent=tangent,
         gradual=best.gradual,
         like_turn=like_turn,
+        variance=best.variance,
     )
 
 

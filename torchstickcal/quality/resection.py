@@ -83,6 +83,24 @@ def resected(
             break
     if not bool(rotation.isfinite().all() and translation.isfinite().all()):
         return None
+    return _compared(points, pixels, sigma_px, camera, (rotation, translation), moments)
+
+
+def placed_at(
+    points: Tensor, pixels: Tensor, sigma_px: Tensor, camera: Intrinsics, pose: tuple[Tensor, Tensor]
+) -> Resection | None:
+    """A camera where it is, with the points that agree; None where there are too few. The arguments are those of
+    :func:`resected`."""
+    if points.shape[1] < _LEAST_POINTS:
+        return None
+    return _compared(points, pixels, sigma_px, camera, pose, torch.eye(6).to(points))
+
+
+def _compared(
+    points: Tensor, pixels: Tensor, sigma_px: Tensor, camera: Intrinsics, pose: tuple[Tensor, Tensor], moments: Tensor
+) -> Resection:
+    """A camera at a place, and which keypoints agree with it."""
+    rotation, translation = pose
     in_camera = rotation @ points + translation[:, None]
     reach = (AGREEING_SIGMAS * sigma_px).clamp_min(LEAST_REACH * float(camera.focal_px.mean()))
     distance = lengths(camera.project(in_camera.mT[None])[0].mT - pixels)

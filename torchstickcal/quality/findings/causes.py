@@ -6,9 +6,8 @@ import math
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 
-from torchstickcal.geometry import se3
-from torchstickcal.metrics import rotation_angle
 from torchstickcal.quality.evidence import Evidence
+from torchstickcal.quality.far import FARTHEST_DEG, moved_far
 from torchstickcal.quality.finding import Finding, Severity
 from torchstickcal.quality.registry import findings
 from torchstickcal.quality.resection import Resection
@@ -31,8 +30,9 @@ _SOUND_SHARE, _GAIN, _CLEAR_GAIN = 0.6, 0.15, 0.08
 where it is nearly right."""
 _ALIKE, _ALIKE_DISTANCE = 0.05, 1.15
 """Difference of shares, and ratio of distances, up to which the simpler of two explanations is the one."""
-_CLOSER = 0.8
-"""Ratio of distances from which on an explanation with an equal share is better than none."""
+_CLOSER, _CLOSER_IF_WRONG = 0.8, 0.9
+"""Ratio of distances from which on an explanation with an equal share is better than none: of any camera, and of one whose
+intrinsics are surely not as given."""
 _WHOLE_SHARE = 0.8
 _ALIEN_SHARE = 0.75
 """Share of a camera's keypoints that agree, over that of the others, below which it shows something else."""
@@ -43,8 +43,6 @@ where the camera seems to fit as given."""
 _MOVING_SHARE, _MOVING_SPREAD = 0.5, 0.05
 """Share of the keypoints of short parts that agree, each part at its own place, where a camera turns all the time, and how far
 these places are apart at most, as a share of the rig. What shows something else has 0.4 and places that differ by more."""
-_FARTHEST_DEG, _FARTHEST_SHARE = 45.0, 0.3
-"""Largest change of a camera that is a motion of it, the shift as a share of the rig; beyond, it shows something else."""
 _MOST_SUSPECTS = 4
 _SHARE_OF_NOISE = 0.1
 """Share of agreeing keypoints that is worth as much as noise smaller by the factor e."""
@@ -121,10 +119,13 @@ def _explained(evidence: Evidence, camera: int, rest: Rest, agreement: float) ->
 
     found = [(h, placed[0]) for h in hypotheses() if (placed := rest.placed(h.changed(sight))) is not None]
     best = _best(found)
-    if best is not None and not _explains(best[1], None if plain is None else plain[0]):
+    if best is not None and not _explains(best[1], None if plain is None else plain[0], bool(evidence.absurd_focals[camera])):
         best = None
     moved = moved_within(rest, sight) if as_given < _WHOLE_SHARE or best is not None else None
-    finding = None if moved is None else _moved(evidence, camera, *moved)
+    finding = None
+    if moved is not None:
+        before, after = ((place.rotation, place.translation) for place in moved[1:])
+        finding = moved_far(evidence, camera, moved[0], before, after)
     if best is not None and (moved is None or finding is None or not _closer(moved[1:], best[1])):
         hypothesis, placed = best
         return cause(hypothesis.code, hypothesis.what, hypothesis.advice, placed.share)
@@ -179,18 +180,25 @@ def _best(found: list[tuple[Hypothesis, Resection]]) -> tuple[Hypothesis, Resect
     return next((one for one in alike if one[1].distance_sigmas <= _ALIKE_DISTANCE * least), None)
 
 
-def _explains(placed: Resection, plain: Resection | None) -> bool:
-    """Whether a camera as it would be by an explanation fits the others clearly better than as given."""
+def _explains(placed: Resection, plain: Resection | None, surely_wrong: bool) -> bool:
+    """Whether a camera as it would be by an explanation fits the others clearly better than as given.
+
+    Args:
+        placed: by the explanation.
+        plain: as given.
+        surely_wrong: whether its intrinsics are surely not as given.
+    """
     if placed.share < _SOUND_SHARE or placed.distance_sigmas > _NEAR_SIGMAS or plain is None:
         return placed.share > _SOUND_SHARE and placed.distance_sigmas < _NEAR_SIGMAS
-    closer = placed.share > plain.share - _ALIKE and placed.distance_sigmas < _CLOSER * plain.distance_sigmas
+    ratio = _CLOSER_IF_WRONG if surely_wrong else _CLOSER
+    closer = placed.share > plain.share - _ALIKE and placed.distance_sigmas < ratio * plain.distance_sigmas
     gain = _GAIN if plain.share < _SOUND_SHARE else _CLEAR_GAIN
     return closer or placed.share > plain.share + gain
 
 
 def _follows(moving: Moving, as_given: float, rig_m: float) -> bool:
     """Whether a camera that was placed in short parts of the session turned all the time, and showed the same as the others."""
-    near = moving.angle_deg < _FARTHEST_DEG and moving.spread_m < _MOVING_SPREAD * rig_m
+    near = moving.angle_deg < FARTHEST_DEG and moving.spread_m < _MOVING_SPREAD * rig_m
     return near and moving.share > max(_MOVING_SHARE, as_given + _GAIN)
 
 
@@ -198,26 +206,6 @@ def _closer(places: Sequence[Resection], single: Resection) -> bool:
     """Whether a camera fits the others at two places as often as at one by another explanation, and clearly closer."""
     farthest, least = max(one.distance_sigmas for one in places), min(one.share for one in places)
     return least > single.share - _ALIKE and farthest < _CLOSER * single.distance_sigmas
-
-
-def _moved(evidence: Evidence, camera: int, frame: int, before: Resection, after: Resection) -> Finding | None:
-    name = evidence.camera(camera)
-    poses = [(one.rotation, one.translation) for one in (before, after)]
-    angle = float(rotation_angle(poses[1][0] @ poses[0][0].mT).rad2deg())
-    shift = float((se3.camera_centres(*poses[1]) - se3.camera_centres(*poses[0])).norm())
-    if angle > _FARTHEST_DEG or shift > _FARTHEST_SHARE * evidence.rig_m:
-        return None
-    return Finding(
-        "camera_moved",
-        Severity.SERIOUS,
-        f"{name} moved by {angle:.2g} degrees and {1000 * shift:.2g} mm between frames {frame - 1} and {frame} (± 2).",
-        "Calibrate the frames before and after it separately (Observations.with_camera_split).",
-        cameras=(name,),
-        frames=(frame, evidence.observations.num_frames - 1),
-        figure=angle,
-        unit="deg",
-        is_cause=True,
-    )
 
 
 def _of_a_pair(evidence: Evidence) -> Iterator[Finding]:

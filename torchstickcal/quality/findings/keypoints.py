@@ -89,7 +89,7 @@ def _labels(evidence: Evidence) -> Iterator[Finding]:
                     unit="frames",
                 )
     for camera, count in enumerate(labels.other_person[0].sum(-1).tolist()):
-        if count:
+        if count and camera not in evidence.changes_at_end:
             yield Finding(
                 "other_person",
                 Severity.SERIOUS if count > _OTHER_PERSON_SHARE * frames else Severity.NOTE,

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -26,9 +27,12 @@ _WRONG_FOCAL = 0.02
 """Error of a focal length from which on the camera's distance is wrong by 2 %. Biased keypoints alone make 1 to 2 %."""
 _ANOTHER_CAMERA = 0.3
 """Error of a focal length that no calibration of the same camera makes: an estimate that far away is doubted too."""
-_FAR_FOCAL, _FAR_SIGMAS = 0.03, 3.0
+_FAR_FOCAL, _FAR_SIGMAS, _FAR_BY_CHANCE = 0.03, 3.0, 0.005
 """Error of a focal length that no careful calibration makes, from which on less evidence is enough, where the errors of the
-keypoints are not always the same."""
+keypoints are not always the same: for the common factor of all cameras, in standard deviations; for the most doubtful of all
+cameras, as the share of sound sessions in which chance reaches it."""
+_BIASED_FOCAL = 0.1
+"""The same where they are: biased keypoints alone make 1 to 2 %, and a wrong focal length makes such errors too."""
 _UNSEEN_FOCAL = 0.05
 """Error of all focal lengths from which on it is said that the keypoints would not show it."""
 _IN_STEP_FRAMES = 0.15
@@ -111,12 +115,18 @@ def _contradicted(evidence: Evidence, unknown: CameraUnknown, parameter: CameraP
     if unknown.noticeable_prior_share is None or guessed or (parameter.refined and unknown.family == "clock"):
         return
     names = ("value", "std") if parameter.refined else ("suggested", "suggested_std")
-    first = (parameter.by_component(name)[:, 0].tolist() for name in (*names, "given", "prior_std"))
-    for camera, (value, std, given, prior_std) in enumerate(zip(*first, strict=True)):
-        unusual = unknown.name == "focal" and not parameter.refined and abs(value - given) > _FAR_FOCAL * abs(given)
-        limit = _FAR_SIGMAS if unusual and evidence.constant_errors_sigmas < CONSTANT_SIGMAS else _CONTRADICTED_SIGMAS
+    first = zip(*(parameter.by_component(name)[:, 0].tolist() for name in (*names, "given", "prior_std")), strict=True)
+    alone = _far_alone(evidence) if unknown.name == "focal" and not parameter.refined else None
+    for camera, (value, std, given, prior_std) in enumerate(first):
+        limit = _CONTRADICTED_SIGMAS
+        if alone is not None and alone.camera == camera and abs(value - given) < limit * std:
+            value, std, limit = alone.value, alone.std, alone.limit
         if not abs(value - given) > max(limit * std, unknown.noticeable_prior_share * prior_std):
             continue
+        if unknown.name == "focal" and not parameter.refined:
+            limit = evidence.slow_changes_beside(camera, value / given).least(limit)
+            if not abs(value - given) > limit * std:
+                continue
         matters = not parameter.refined and _matters(evidence, unknown.name, value - given, given)
         far = parameter.refined and unknown.name == "focal" and abs(value - given) > _ANOTHER_CAMERA * abs(given)
         name = evidence.camera(camera)
@@ -138,6 +148,31 @@ def _contradicted(evidence: Evidence, unknown: CameraUnknown, parameter: CameraP
             unit="standard deviations",
             is_cause=matters and evidence.explains_most(unknown.family),
         )
+
+
+class _Alone(NamedTuple):
+    """The camera whose focal length the keypoints contradict most, where those of the others are as given."""
+
+    camera: int
+    value: float
+    """pixels"""
+    std: float
+    limit: float
+    """standard deviations that chance hardly reaches in any of the cameras"""
+
+
+def _far_alone(evidence: Evidence) -> _Alone | None:
+    """The focal length that is the most doubtful by itself; None unless it is as wrong as no careful calibration makes it."""
+    if evidence.check is None:
+        return None
+    values, stds = (own[:, 0] for own in evidence.check.suggestion_of_one("focal"))
+    camera = int((values / stds).abs().nan_to_num(0.0).argmax())
+    change, given = float(values[camera].expm1()), float(evidence.unknowns["focal"].given[camera])
+    biased = evidence.constant_errors_sigmas >= CONSTANT_SIGMAS
+    if not abs(change) > (_BIASED_FOCAL if biased else _FAR_FOCAL):
+        return None
+    limit = torch.special.ndtri(torch.tensor(1 - _FAR_BY_CHANCE / (2 * evidence.cameras), dtype=torch.float64))
+    return _Alone(camera, given * (1 + change), given * float(stds[camera]), float(limit))
 
 
 def _all_focals(evidence: Evidence) -> Iterator[Finding]:
