@@ -161,11 +161,14 @@ class Evidence:
     @cached_property
     def misfits(self) -> Tensor:
         """(C,), whether a camera seems to show something else than the others: fewer of its keypoints agree, and the errors of
-        those that do stay alike from frame to frame, while those of the other cameras do not."""
+        those that do stay alike from frame to frame, while those of the other cameras do not. Not one that moved."""
         behind = self.agreement < _MISFIT_SHARE * self.agreement.median()
         if self.cameras < 3 or not bool(behind.any()):
             return torch.zeros_like(behind)
-        return behind & (self._lasting > self._lasting.median() + _MISFIT_LASTING)
+        behind &= self._lasting > self._lasting.median() + _MISFIT_LASTING
+        if bool(behind.any()) and self.motion is not None and self.motion.evidence > self.motion.least:
+            behind[self.motion.camera] = False
+        return behind
 
     @property
     def _lasting(self) -> Tensor:

@@ -48,11 +48,12 @@ def _judged(evidence: Evidence) -> Quality:
 
 def _worth_trying(evidence: Evidence, found: dict[Family, list[Finding]]) -> bool:
     """Whether something is wrong, or may be, that no finding explains."""
-    unexplained = evidence.off_centre | evidence.set_aside_at_end | evidence.misfits
+    unexplained = evidence.off_centre | evidence.set_aside_at_end
     if any(camera not in evidence.changes_at_end for camera in unexplained.nonzero().flatten().tolist()):
         return True
     every = [finding for own in found.values() for finding in own]
     wrong = any(finding.severity >= Severity.SERIOUS or finding.code == "camera_doubtful" for finding in every)
+    wrong |= bool(evidence.misfits.any())
     wrong |= evidence.cameras == 3 and evidence.noise_mrad > _NOISY_OF_THREE_MRAD
     explaining = [family for family, own in found.items() if any(finding.is_cause for finding in own)]
     serious = [family for family, own in found.items() if any(finding.severity >= Severity.SERIOUS for finding in own)]
