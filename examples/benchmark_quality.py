@@ -206,6 +206,26 @@ def dropped(given: SimulatedSession, camera: int, frame: int, count: int) -> Obs
     return with_camera(given.observations, camera, left)
 
 
+def doubled(given: SimulatedSession, camera: int) -> Observations:
+    """One camera each frame of which was written twice, as where its video was converted to a higher frame rate."""
+    keypoints = given.observations.keypoints[camera]
+    return with_camera(given.observations, camera, keypoints[torch.arange(len(keypoints)) // 2 * 2])
+
+
+def stopped(given: SimulatedSession, camera: int, rng: np.random.Generator) -> Observations:
+    """One camera whose video stops at some frame."""
+    keypoints = given.observations.keypoints[camera]
+    last = int(rng.uniform(0.3, 0.7) * len(keypoints))
+    return with_camera(given.observations, camera, keypoints[torch.arange(len(keypoints)).clamp_max(last)])
+
+
+def following(given: SimulatedSession, camera: int, rng: np.random.Generator) -> Observations:
+    """One camera that turns to and fro to keep the athlete in its middle."""
+    frames = given.observations.num_frames
+    share = torch.sin(torch.linspace(0, float(rng.uniform(1, 3)) * torch.pi, frames).double())
+    return replace(given.observations, keypoints=knocked(given, camera, share, float(rng.uniform(2, 8)), 0.0, rng))
+
+
 def second_view(given: SimulatedSession, camera: int, shift_m: float, rng: np.random.Generator) -> torch.Tensor:
     """What a camera sees from beside another."""
     other = (camera + 1) % given.observations.num_cameras
@@ -303,6 +323,9 @@ KINDS: dict[str, Kind] = {
         MOVED,
         elsewhere=(0,),
     ),
+    "a camera follows the athlete": Kind(lambda s, c, r: following(s, c, r), ("camera_moving", *MOVED), elsewhere=(0,)),
+    "a camera's video stops": Kind(lambda s, c, r: stopped(s, c, r), ("frames_repeated",)),
+    "a camera of half the frame rate": Kind(lambda s, c, r: doubled(s, c), ("frames_repeated",)),
     "one camera 8 frames late": Kind(lambda s, c, r: later(s, c, 8), CLOCK),
     "one camera lost 6 frames": Kind(lambda s, c, r: dropped(s, c, s.observations.num_frames // 2, 6), (*CLOCK, *MOVED)),
     "stick given in feet": Kind(

@@ -220,6 +220,24 @@ def test_keypoints_in_the_corner_are_named():
     assert Observations(**arguments(keypoints=changed(0.0, (0, 1, 2, 0)))).warnings == ()
 
 
+@pytest.mark.parametrize(("points", "elsewhere", "used"), [(7, False, False), (6, False, True), (7, True, True)])
+def test_copies_of_the_frame_before_are_found_and_not_used(points: int, elsewhere: bool, used: bool):
+    """Where enough points are seen, here 6, and unless all cameras show copies."""
+    keypoints = np.random.default_rng(0).uniform(1, 900, (3, 8, points, 2))
+    keypoints[1, 2, 0] = np.nan
+    keypoints[1 if not elsewhere else slice(None), 3:5] = keypoints[1 if not elsewhere else slice(None), 2:3]
+    with warnings.catch_warnings(record=True) as warned:
+        warnings.simplefilter("always")
+        observations = Observations(keypoints, np.diag([900.0, 900, 1]), Stick(2, 3, 1.0), camera_names=["a", "b", "c"])
+    found = [[3, 4] if points == 7 and (camera == 1 or elsewhere) else [] for camera in range(3)]
+    assert [camera.nonzero().flatten().tolist() for camera in observations.repeated] == found
+    seen = observations.keypoints.isfinite().all(-1)
+    seen[1, 3:5] &= used
+    assert torch.equal(observations.visible, seen)
+    said = [name for name, frames in zip("abc", found, strict=True) if frames and not elsewhere]
+    assert [str(one.message)[:15] for one in warned] == [f"{name}: 2 of 8 frame" for name in said]
+
+
 def test_a_calibration_names_keypoints_in_the_corner():
     observations, _ = golf_session(cameras=3, frames=10, noise=Noise(sigma_px=1.0))
     keypoints = observations.keypoints.clone()

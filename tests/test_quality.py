@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import json
 import pickle
+import re
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
@@ -127,6 +128,76 @@ def test_the_cause_is_named_first(change: Callable[[SimulatedSession], Observati
     assert quality.verdict in (Verdict.POOR, Verdict.FAILED)
     assert codes(quality)[0] == code
     assert quality.findings[0].is_cause
+
+
+@pytest.mark.parametrize(("factor", "said"), [(0.75, True), (4 / 3, True), (1.05, False)])
+def test_focal_lengths_of_other_proportions_are_said(factor: float, said: bool):
+    given = session(cameras=3, frames=20).observations
+    changed = replace(given, intrinsics=given.cameras.matrix * torch.tensor([[factor, 1, 1], [1, 1, 1], [1, 1, 1]]).double())
+    found = codes(calibrate(changed).quality)
+    assert found.count("pixels_not_square") == (3 if said else 0)
+
+
+@pytest.mark.parametrize(("cameras", "code"), [(3, "stick_not_rigid"), (4, "points_noisy")])
+def test_an_end_that_is_a_mark_on_the_floor_is_no_end(cameras: int, code: str):
+    given = session(cameras=cameras, frames=60).observations
+    keypoints, head = given.keypoints.clone(), given.sticks[0].ends[1]
+    keypoints[:, :, head] = keypoints[:, :, head].nanmedian(1, keepdim=True).values
+    quality = calibrate(replace(given, keypoints=keypoints)).quality
+    assert quality.verdict is Verdict.POOR
+    assert code in codes(quality)[:2]
+
+
+@pytest.mark.parametrize(
+    ("frames_alike", "worse", "error_px", "alien"),
+    [(12, [4], 7.0, True), (12, [0], 7.0, True), (1, [4], 3.5, False), (12, [0, 1, 2, 3, 4], 7.0, False)],
+)
+def test_a_camera_that_fits_worse_for_long_shows_something_else(
+    frames_alike: int, worse: list[int], error_px: float, alien: bool
+):
+    """Not where its errors change from frame to frame, nor where those of all cameras last."""
+    given = session(frames=80)
+    draws = torch.randn(5, 80 // frames_alike + 2, 21, 2, generator=torch.Generator().manual_seed(3), dtype=torch.float64)
+    slow = torch.nn.functional.interpolate(draws.flatten(2).mT, scale_factor=frames_alike, mode="linear").mT[:, :80]
+    errors = torch.zeros(5, 80, 21, 2).double()
+    errors[worse] = error_px * slow.unflatten(2, (21, 2))[worse]
+    calibration = calibrate(replace(given.observations, keypoints=given.observations.keypoints + errors))
+    evidence = evidence_of(calibration)
+    assert evidence.misfits.tolist() == [alien and camera in worse for camera in range(5)]
+    assert ("camera_alien" in codes(calibration.quality)) == alien
+
+
+@pytest.mark.parametrize("turn_deg", [3.0, 6.0])
+def test_a_camera_that_follows_the_athlete_is_named(turn_deg: float):
+    """It turns to one side and back."""
+    given = session(frames=60)
+    truth, share = given.truth, torch.sin(torch.linspace(0, 2 * torch.pi, 60).double())
+    assert truth.points is not None
+    turns, _ = se3.exp(share[:, None] * torch.tensor([0, 0, 0, 0, turn_deg * torch.pi / 180, 0]).double())
+    in_camera = torch.einsum("ij,fpj->fpi", truth.rotations[1], truth.points) + truth.translations[1]
+    seen = [given.observations.cameras[1:2].project(x.flatten(0, 1)[None])[0] for x in (in_camera, in_camera @ turns.mT)]
+    shift = (seen[1] - seen[0]).view(60, -1, 2)
+    quality = calibrate(with_camera(given.observations, 1, lambda keypoints: keypoints + shift)).quality
+    assert codes(quality)[0] == "camera_moving"
+    (angle,) = re.findall(r"by up to ([\d.]+) degrees", quality.findings[0].meaning)
+    assert float(angle) == pytest.approx(2 * turn_deg, rel=0.3)
+
+
+@pytest.mark.parametrize(
+    ("camera", "step", "severity"), [(0, 2, Severity.CAUTION), (2, 3, Severity.CAUTION), (1, 40, Severity.NOTE)]
+)
+def test_frames_that_are_copies_are_said_and_not_used(camera: int, step: int, severity: Severity):
+    given = session(frames=60)
+    copied = torch.arange(60) // step * step
+    if severity is Severity.NOTE:
+        copied = torch.where(torch.arange(60) == step, step - 1, torch.arange(60))
+    calibration = calibrate(with_camera(given.observations, camera, lambda keypoints: keypoints[copied]))
+    (finding,) = (finding for finding in calibration.quality.findings if finding.code == "frames_repeated")
+    assert (finding.severity, finding.cameras) == (severity, (calibration.camera_names[camera],))
+    expected = with_camera(
+        given.observations, camera, lambda keypoints: keypoints.where((copied == torch.arange(60))[:, None, None], torch.nan)
+    )
+    assert torch.equal(calibration.translations, calibrate(expected).translations)
 
 
 def test_missing_keypoints_at_the_corner_do_not_make_a_camera_doubtful():
@@ -449,7 +520,7 @@ def test_errors_that_depend_on_the_view_of_few_points_are_no_motion_of_a_camera(
 
 
 @pytest.mark.parametrize(
-    ("sport", "cameras", "error", "step_px"), [("baseball", 4, 1.0, 1.0), ("kendo", 5, 0.0, 0.5), ("golf", 4, 1.0, 3.0)]
+    ("sport", "cameras", "error", "step_px"), [("baseball", 4, 1.0, 1.0), ("kendo", 5, 0.0, 0.5), ("golf", 4, 1.0, 1.0)]
 )
 def test_a_camera_that_moved_is_found_by_two_balls(sport: str, cameras: int, error: float, step_px: float):
     observations = two_balls(sport, cameras, 2, error)

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import sys
 import warnings
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -21,10 +21,26 @@ LEAST_CONFIDENCE = 1e-4
 point, such keypoints would: with errors and gradients that are larger the smaller the confidence is."""
 _NO_CONFIDENCE = 1e-12
 """Confidence up to which a keypoint counts as not seen in any case: smaller numbers overflow when they are inverted."""
+_LEAST_REPEATED = 6
+"""Keypoints that a frame needs to be told from the frame before: a few, in whole pixels, are equal by chance."""
 _COEFFICIENTS = (4, 5, 8, 12, 14)
 _FISHEYE_COEFFICIENTS = (4,)
 _LARGEST_INTRINSIC = 1e9
 """Beyond any camera; squares of larger numbers may not be numbers at all."""
+
+
+class Doubt(NamedTuple):
+    """Something that is probably not meant as it was given."""
+
+    code: str
+    meaning: str
+    advice: str
+    share: float
+    """of the keypoints, or of a camera's frames"""
+    camera: str | None = None
+    """the only one that it is about"""
+    negligible: float = 0.0
+    """share up to which nobody is warned"""
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,7 +76,8 @@ class Observations:
         ObservationError: for anything that cannot be used.
 
     Warns:
-        ObservationWarning: if keypoints lie exactly at (0, 0), by which many detectors mean "not seen".
+        ObservationWarning: if keypoints lie exactly at (0, 0), by which many detectors mean "not seen", or if more than 5 % of
+            a camera's frames are exact copies of the frame before, while other cameras show new frames.
 
     Example:
         >>> import numpy as np
@@ -90,7 +107,10 @@ class Observations:
     timestamps: Tensor | None = None
     readout_s: float | None = None
     visible: Tensor = field(init=False, repr=False, compare=False)
-    """(C, F, P), True where a keypoint is given with a confidence that counts."""
+    """(C, F, P), True where a keypoint is given with a confidence that counts, and is not one of a repeated frame."""
+    repeated: Tensor = field(init=False, repr=False, compare=False)
+    """(C, F), True where all keypoints of a camera are exactly those of the frame before, as where its video was converted to a
+    higher frame rate, or stopped. Such a frame shows an earlier time. It is not used where another camera shows a new one."""
 
     def __init__(
         self,
@@ -136,7 +156,9 @@ class Observations:
         if self.confidence is not None:
             largest = self.confidence.where(visible, 0.0).max()
             visible = visible & (self.confidence > (LEAST_CONFIDENCE * largest).clamp_min(_NO_CONFIDENCE))
-        put(self, "visible", visible)
+        put(self, "repeated", _repeated(self.keypoints, visible))
+        fresh = (visible.any(-1) & ~self.repeated).any(0)
+        put(self, "visible", visible & ~(self.repeated & fresh)[..., None])
         put(self, "sticks", located_sticks(sticks, self.point_names))
         self._check_sticks()
         if sys._getframe(1).f_globals.get("__name__") != "dataclasses":  # replace() changes what has been warned about
@@ -194,15 +216,44 @@ class Observations:
         return (self.keypoints == 0).all(-1) & self.visible
 
     @property
-    def warnings(self) -> tuple[str, ...]:
+    def doubts(self) -> tuple[Doubt, ...]:
         """What is probably not meant as it was given."""
-        at_corner = int(self.at_corner.sum())
-        if not at_corner:
-            return ()
-        return (
-            f"{at_corner} of {int(self.visible.sum())} keypoints lie exactly at (0, 0), the corner of the image, by which many "
-            "detectors mean that a point was not seen. They are used as given. Set them to NaN if they were not seen.",
-        )
+        return (*self._at_corner_doubt(), *self._repeated_doubts())
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """The doubts that a user is warned of, in words."""
+        return tuple(f"{doubt.meaning} {doubt.advice}" for doubt in self.doubts if doubt.share > doubt.negligible)
+
+    def _at_corner_doubt(self) -> Iterator[Doubt]:
+        if at_corner := int(self.at_corner.sum()):
+            total = int(self.visible.sum())
+            yield Doubt(
+                "keypoints_at_corner",
+                f"{at_corner} of {total} keypoints lie exactly at (0, 0), the corner of the image, by which many detectors "
+                "mean that a point was not seen. They are used as given.",
+                "Set them to NaN if they were not seen.",
+                at_corner / total,
+            )
+
+    def _repeated_doubts(self) -> Iterator[Doubt]:
+        used = (self.repeated & self.visible.any(-1)).any(1)
+        for camera in self.repeated.any(1).nonzero().flatten().tolist():
+            name, count = self.camera_label(camera), int(self.repeated[camera].sum())
+            effect = (
+                "They are used where no other camera shows a new frame: all deviations are then too small."
+                if bool(used[camera])
+                else "They are not used: they show an earlier time than the other cameras do."
+            )
+            yield Doubt(
+                "frames_repeated",
+                f"{name}: {count} of {self.num_frames} frames are exact copies of the frame before, as where a video stopped "
+                f"or was converted to a higher frame rate. {effect}",
+                "Take its keypoints from the video as it was recorded.",
+                count / self.num_frames,
+                name,
+                negligible=1.0 if bool(used[camera]) else 0.05,
+            )
 
     def to(self, device: torch.device | str) -> Observations:
         """The same observations on another device."""
@@ -469,6 +520,19 @@ def _readout(readout_s: Any) -> float:
         most=10.0,
         several="Where they differ, give the timestamps of the middle rows instead, or estimate them (refine 'readout').",
     )
+
+
+def _repeated(keypoints: Tensor, visible: Tensor) -> Tensor:
+    """(C, F), True where all keypoints of a camera are exactly those of the frame before."""
+    repeated = torch.zeros_like(visible[..., 0])
+    x = keypoints[..., 0]
+    alike = (x[:, 1:] == x[:, :-1]).sum(-1) >= _LEAST_REPEATED
+    if not bool(alike.any()):
+        return repeated
+    before, after = visible[:, :-1], visible[:, 1:]
+    equal = (keypoints[:, 1:] == keypoints[:, :-1]).all(-1) | ~before
+    repeated[:, 1:] = (equal & (before == after)).all(-1) & (after.sum(-1) >= _LEAST_REPEATED)
+    return repeated
 
 
 def _times(timestamps: Any, keypoints: Tensor) -> Tensor:

@@ -35,6 +35,10 @@ _CONSISTENT_SHARE, _BEHIND_OTHERS, _NOISY_MRAD = 0.62, 0.85, 10.0
 whose cameras see one scene. Sound cameras keep 84 % and more, with 20 % of wrong keypoints 66 %."""
 DOUBTFUL_SHARE = 0.78
 """Share of a camera's keypoints that agree, below which it is doubted where the other cameras have more."""
+_MISFIT_SHARE, _MISFIT_LASTING = 0.92, 0.3
+"""Share of a camera's keypoints that agree, over that of the median camera, below which, and correlation of its errors from
+frame to frame, beyond that of the median camera, above which it shows something else. Sound cameras have 0.97 and more, and
+differ by 0.1 at most. Mirrored and alien ones that fit at another place have 0.87 and less, and differ by 0.4 and more."""
 _NEAR_FOCAL = 0.3
 """Logarithm of an estimated or suggested over the given focal length: from here on, something else is wrong."""
 _FAR_SIGMAS = 5.0
@@ -152,6 +156,27 @@ class Evidence:
     def doubtful(self) -> Tensor:
         """(C,), whether clearly fewer keypoints of a camera agree than of the others."""
         return (self.agreement < DOUBTFUL_SHARE) & (self.agreement < _BEHIND_OTHERS * self.agreement.median())
+
+    @cached_property
+    def misfits(self) -> Tensor:
+        """(C,), whether a camera seems to show something else than the others: fewer of its keypoints agree, and the errors of
+        those that do stay alike from frame to frame, while those of the other cameras do not."""
+        behind = self.agreement < _MISFIT_SHARE * self.agreement.median()
+        if self.cameras < 3 or not bool(behind.any()):
+            return torch.zeros_like(behind)
+        return behind & (self._lasting > self._lasting.median() + _MISFIT_LASTING)
+
+    @property
+    def _lasting(self) -> Tensor:
+        """(C,), correlation of a camera's residuals with those of the frame before."""
+        products, squares = torch.zeros(2, self.cameras, dtype=torch.float64, device=self.sigma_px.device)
+        for _, errors, _ in self._errors_px:
+            scaled = errors / self.sigma_px
+            before, after = scaled[:, :, :-1], scaled[:, :, 1:]
+            both = (before != 0) & (after != 0)
+            products += (before * after).flatten(1).sum(1)
+            squares += (before.square() + after.square()).where(both, 0.0).flatten(1).sum(1) / 2
+        return products / squares.clamp_min(1e-9)
 
     @cached_property
     def set_aside_at_end(self) -> Tensor:

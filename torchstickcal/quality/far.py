@@ -9,7 +9,7 @@ from torchstickcal.metrics import rotation_angle
 from torchstickcal.quality.evidence import Evidence
 from torchstickcal.quality.finding import Finding, Severity
 
-_FARTHEST_DEG, _FARTHEST_SHARE = 45.0, 0.3
+FARTHEST_DEG, _FARTHEST_SHARE = 45.0, 0.3
 """Largest change of a camera that is a motion of it, the shift as a share of the rig; beyond, it shows something else."""
 
 
@@ -29,7 +29,7 @@ def moved_far(
     name = evidence.camera(camera)
     angle = float(rotation_angle(after[0] @ before[0].mT).rad2deg())
     shift = float((se3.camera_centres(*after) - se3.camera_centres(*before)).norm())
-    if angle > _FARTHEST_DEG or shift > _FARTHEST_SHARE * evidence.rig_m:
+    if angle > FARTHEST_DEG or shift > _FARTHEST_SHARE * evidence.rig_m:
         return None
     return Finding(
         "camera_moved",

@@ -42,7 +42,7 @@ def _judged(evidence: Evidence) -> Quality:
 
 def _worth_trying(evidence: Evidence, found: dict[Family, list[Finding]]) -> bool:
     """Whether something is wrong, or may be, that no finding explains."""
-    unexplained = evidence.off_centre | evidence.set_aside_at_end
+    unexplained = evidence.off_centre | evidence.set_aside_at_end | evidence.misfits
     if any(camera not in evidence.changes_at_end for camera in unexplained.nonzero().flatten().tolist()):
         return True
     every = [finding for own in found.values() for finding in own]

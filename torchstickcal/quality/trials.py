@@ -12,7 +12,9 @@ from torch import Tensor
 
 from torchstickcal.config import Config
 from torchstickcal.errors import CalibrationError, ObservationError
+from torchstickcal.geometry import se3
 from torchstickcal.geometry.cameras import Intrinsics
+from torchstickcal.metrics import rotation_angle
 from torchstickcal.observations import Observations
 from torchstickcal.pipeline.adjust import adjust_cameras, begin
 from torchstickcal.pipeline.adjustment import Adjustment
@@ -27,6 +29,8 @@ _SCALES = (1 / 3, 0.5, 2 / 3, 0.75, 4 / 3, 1.5, 2.0, 3.0)
 _LEAST_OF_PLACES, _GAIN_OF_PLACES, _RATIO_OF_PLACES = 0.45, 0.1, 1.25
 """Share of a camera's keypoints that agree with it at two places, one before and one after some frame: the least, and over that
 at one place. Or half of those that contradict it at one place agree."""
+_PARTS, _PART_FRAMES = 16, 3
+"""Parts of a session in which a camera that moves all the time is placed, and their frames."""
 _LARGEST_SHIFT_S = 1.0
 _COARSE_SHIFTS = 12
 
@@ -235,6 +239,33 @@ def moved_within(rest: Rest, sight: Sight) -> tuple[int, Resection, Resection] |
         return None
     before, after = rest.placed(sight, slice(0, frame)), rest.placed(sight, slice(frame, frames))
     return None if before is None or after is None else (frame, before[0], after[0])
+
+
+class Moving(NamedTuple):
+    """A camera that was placed anew in short parts of the session."""
+
+    share: float
+    """of its keypoints in these parts that agree with the others"""
+    angle_deg: float
+    """largest angle between two of its places"""
+    spread_m: float
+    """median distance of its places from their middle"""
+
+
+def moving_throughout(rest: Rest, sight: Sight) -> Moving | None:
+    """A camera, placed anew in some parts of a session in which one that follows the athlete hardly turns; None where it can be
+    placed in few of them."""
+    frames = rest.points.shape[1]
+    starts = torch.linspace(0, max(0, frames - _PART_FRAMES), min(_PARTS, frames // _PART_FRAMES)).long().tolist()
+    places = [found[0] for start in starts if (found := rest.placed(sight, slice(start, start + _PART_FRAMES))) is not None]
+    if len(places) < _PARTS // 2:
+        return None
+    agreeing = torch.cat([place.agreeing for place in places])
+    rotations = torch.stack([place.rotation for place in places])
+    centres = se3.camera_centres(rotations, torch.stack([place.translation for place in places]))
+    angles = rotation_angle(rotations[:, None] @ rotations[None].mT).rad2deg()
+    spread = (centres - centres.median(0).values).norm(dim=-1).median()
+    return Moving(float(agreeing.double().mean()), float(angles.max()), float(spread))
 
 
 def _agreeing(placed: Resection, rest: Rest, sight: Sight, usable: Tensor) -> Tensor:

@@ -7,16 +7,18 @@ from collections.abc import Iterator, Sequence
 from dataclasses import replace
 
 from torchstickcal.quality.evidence import Evidence
-from torchstickcal.quality.far import moved_far
+from torchstickcal.quality.far import FARTHEST_DEG, moved_far
 from torchstickcal.quality.finding import Finding, Severity
 from torchstickcal.quality.registry import findings
 from torchstickcal.quality.resection import Resection
 from torchstickcal.quality.trials import (
     Hypothesis,
+    Moving,
     Rest,
     Sight,
     hypotheses,
     moved_within,
+    moving_throughout,
     shifted_share,
     sight_of,
     tried,
@@ -35,7 +37,12 @@ _WHOLE_SHARE = 0.8
 _ALIEN_SHARE = 0.75
 """Share of a camera's keypoints that agree, over that of the others, below which it shows something else."""
 _IN_TIME_SHARE = 0.85
-"""The same at another time, from which on the camera shows the same thing then: others do similar things at other times."""
+_FITTING_SHARE = 0.95
+"""The same at another time, from which on the camera shows the same thing then: others do similar things at other times. And
+where the camera seems to fit as given."""
+_MOVING_SHARE, _MOVING_SPREAD = 0.5, 0.05
+"""Share of the keypoints of short parts that agree, each part at its own place, where a camera turns all the time, and how far
+these places are apart at most, as a share of the rig. What shows something else has 0.4 and places that differ by more."""
 _MOST_SUSPECTS = 4
 _SHARE_OF_NOISE = 0.1
 """Share of agreeing keypoints that is worth as much as noise smaller by the factor e."""
@@ -56,7 +63,7 @@ def causes(evidence: Evidence) -> Iterator[Finding]:
         return
     agreement = evidence.agreement * (1 - evidence.ended.labels.other_person[0].double().mean(1))
     order = agreement.argsort().tolist()
-    suspicious = (evidence.absurd_focals | evidence.off_centre).tolist()
+    suspicious = (evidence.absurd_focals | evidence.off_centre | evidence.misfits).tolist()
     off_centre = [camera for camera in order if evidence.off_centre[camera]]
     at_end = [camera for camera in order if evidence.set_aside_at_end[camera]]
     doubted = [c for c in order if float(agreement[c]) < _SUSPECT_SHARE or suspicious[c]]
@@ -124,7 +131,8 @@ def _explained(evidence: Evidence, camera: int, rest: Rest, agreement: float) ->
         return cause(hypothesis.code, hypothesis.what, hypothesis.advice, placed.share)
     if finding is not None:
         return finding
-    if as_given > _SOUND_SHARE:
+    misfit, seems_to_fit = bool(evidence.misfits[camera]), as_given > _SOUND_SHARE
+    if seems_to_fit and not misfit:
         if as_given < agreement + _CLEAR_GAIN:
             return None
         return cause(
@@ -135,7 +143,8 @@ def _explained(evidence: Evidence, camera: int, rest: Rest, agreement: float) ->
             is_cause=False,
         )
     later, share = shifted_share(rest, sight, evidence.ended.frames[0].rate_hz)
-    if later and share > max(_SOUND_SHARE, _IN_TIME_SHARE * rest.share, as_given + _GAIN):
+    gain, in_time = (_CLEAR_GAIN, _FITTING_SHARE) if seems_to_fit else (_GAIN, _IN_TIME_SHARE)
+    if later and share > max(_SOUND_SHARE, in_time * rest.share, as_given + gain):
         word = "later" if later > 0 else "earlier"
         return cause(
             "clock_apart",
@@ -143,12 +152,21 @@ def _explained(evidence: Evidence, camera: int, rest: Rest, agreement: float) ->
             "Estimate the time offsets (refine 'time_offset'), or cut its video to begin with the others.",
             share,
         )
-    if agreement > _ALIEN_SHARE * rest.share:
+    if agreement > _ALIEN_SHARE * rest.share and not misfit:
         return None
+    moving = None if seems_to_fit else moving_throughout(rest, sight)
+    if moving is not None and _follows(moving, as_given, evidence.rig_m):
+        return cause(
+            "camera_moving",
+            f"it turns all the time, by up to {moving.angle_deg:.2g} degrees, as a camera that follows the athlete: in short "
+            "parts of the session, its keypoints agree at a place of their own",
+            "Use a camera that stands still, or leave it out.",
+            moving.share,
+        )
     return cause(
         "camera_alien",
-        "its keypoints agree with the other cameras at no place, neither mirrored, turned, scaled nor moved in time: it "
-        "shows another person or another recording",
+        "its keypoints fit the other cameras at no place as theirs fit each other, neither mirrored, turned, scaled nor moved "
+        "in time: it shows another person or another recording",
         "Check which person the detector follows in this camera, and whether the video belongs to this session.",
         max([as_given, *(placed.share for _, placed in found)]),
     )
@@ -176,6 +194,12 @@ def _explains(placed: Resection, plain: Resection | None, surely_wrong: bool) ->
     closer = placed.share > plain.share - _ALIKE and placed.distance_sigmas < ratio * plain.distance_sigmas
     gain = _GAIN if plain.share < _SOUND_SHARE else _CLEAR_GAIN
     return closer or placed.share > plain.share + gain
+
+
+def _follows(moving: Moving, as_given: float, rig_m: float) -> bool:
+    """Whether a camera that was placed in short parts of the session turned all the time, and showed the same as the others."""
+    near = moving.angle_deg < FARTHEST_DEG and moving.spread_m < _MOVING_SPREAD * rig_m
+    return near and moving.share > max(_MOVING_SHARE, as_given + _GAIN)
 
 
 def _closer(places: Sequence[Resection], single: Resection) -> bool:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 
 import torch
@@ -13,6 +14,8 @@ from torchstickcal.quality.registry import findings
 _OFF_CENTRE = 0.25
 """Distance of the principal point from the middle of the image, as a share of half the image, from which on the intrinsics
 belong to other images: lenses are centred to a few per cent."""
+_SQUARE = 1.1
+"""Ratio of the focal lengths of x and y, either way, up to which pixels are square: careful calibrations differ by 1 %."""
 _OUTSIDE_SHARE = 0.05
 _SAME_PX = 1.0
 """Median distance of the keypoints of two cameras below which it is one video. Different cameras have different noise."""
@@ -22,6 +25,7 @@ _SAME_PX = 1.0
 def images(evidence: Evidence) -> Iterator[Finding]:
     """Findings about images and intrinsics."""
     yield from _intrinsics(evidence)
+    yield from _proportions(evidence)
     yield from _off_centre(evidence)
     yield from _same_video(evidence)
 
@@ -82,6 +86,24 @@ def _intrinsics(evidence: Evidence) -> Iterator[Finding]:
             limit=_OFF_CENTRE,
             unit="half images",
             is_cause=code != "principal_point_off_centre",
+        )
+
+
+def _proportions(evidence: Evidence) -> Iterator[Finding]:
+    """Cameras whose focal lengths of x and y differ, as where images were resized to other proportions."""
+    ratio = evidence.observations.cameras.matrix[:, [0, 1], [0, 1]]
+    ratio = ratio[:, 0] / ratio[:, 1]
+    for camera in (ratio.log().abs() > math.log(_SQUARE)).nonzero().flatten().tolist():
+        name = evidence.camera(camera)
+        yield Finding(
+            "pixels_not_square",
+            Severity.CAUTION,
+            f"{name}: its focal lengths of x and y differ by a factor of {float(ratio[camera]):.3g}, as where images were "
+            "resized without keeping their proportions. Nearly all cameras have square pixels.",
+            "Give the intrinsics of the images that the detector saw.",
+            cameras=(name,),
+            figure=float(ratio[camera]),
+            limit=_SQUARE,
         )
 
 

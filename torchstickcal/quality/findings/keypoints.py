@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
+from torchstickcal.observations import Doubt
 from torchstickcal.pipeline.relabel import exchanges
 from torchstickcal.quality.evidence import Evidence
 from torchstickcal.quality.finding import Finding, Severity
@@ -14,6 +15,8 @@ _REJECTED_SHARE = 0.4
 """Sound sessions with 20 % of wrong keypoints lose up to 30 %."""
 _OTHER_PERSON_SHARE = 0.2
 _CORNER_SHARE = 0.02
+_STOPPED_SHARE = 0.8
+"""Share of a camera's frames that are copies of the frame before, from which on hardly anything is left of its video."""
 _WHOLE_PX_NOISE = 0.6
 """Noise, in pixels, below which the rounding of whole pixels, which has a standard deviation of 0.29, matters."""
 _NOISY_MRAD = 10.0
@@ -30,25 +33,22 @@ def keypoints(evidence: Evidence) -> Iterator[Finding]:
 
 
 def _values(evidence: Evidence) -> Iterator[Finding]:
-    """Keypoints at (0, 0), and whole numbers of pixels."""
+    """Keypoints at (0, 0), frames that are copies, and whole numbers of pixels."""
     observations = evidence.observations
-    visible = observations.visible
-    total = max(1, int(visible.sum()))
-    for sentence in observations.warnings:
-        share = int(observations.at_corner.sum()) / total
-        many = share > _CORNER_SHARE
-        meaning, advice = sentence.rsplit(" Set them", 1)
+    for doubt in observations.doubts:
+        severity, limit = _severity(doubt)
         yield Finding(
-            "keypoints_at_corner",
-            Severity.SERIOUS if many else Severity.NOTE,
-            meaning,
-            f"Set them{advice}",
-            figure=share,
-            limit=_CORNER_SHARE,
+            doubt.code,
+            severity,
+            doubt.meaning,
+            doubt.advice,
+            cameras=(doubt.camera,) if doubt.camera else (),
+            figure=doubt.share,
+            limit=limit,
             unit="share",
-            is_cause=many,
+            is_cause=severity > Severity.NOTE,
         )
-    given = observations.keypoints[visible]
+    given = observations.keypoints[observations.visible]
     noise = float(evidence.sigma_px.median())
     if len(given) and noise < _WHOLE_PX_NOISE and bool((given == given.round()).all()):
         yield Finding(
@@ -61,6 +61,15 @@ def _values(evidence: Evidence) -> Iterator[Finding]:
             limit=_WHOLE_PX_NOISE,
             unit="px",
         )
+
+
+def _severity(doubt: Doubt) -> tuple[Severity, float]:
+    """What a doubt about the input means for the result, and the limit that this follows from."""
+    if doubt.code == "keypoints_at_corner":
+        return (Severity.SERIOUS if doubt.share > _CORNER_SHARE else Severity.NOTE), _CORNER_SHARE
+    if doubt.share <= doubt.negligible:
+        return Severity.NOTE, doubt.negligible
+    return (Severity.SERIOUS if doubt.share > _STOPPED_SHARE else Severity.CAUTION), doubt.negligible
 
 
 def _labels(evidence: Evidence) -> Iterator[Finding]:
@@ -130,14 +139,23 @@ def _noise(evidence: Evidence) -> Iterator[Finding]:
     noisy = (evidence.sigma_px > _USELESS_FOCAL_SHARE * focal).nonzero().flatten().tolist()
     if noisy:
         names = tuple(map(evidence.point, noisy))
+        sticks = evidence.kept.sticks.tolist()
+        without_scale = bool(sticks) and all(set(ends) & set(noisy) for ends in sticks)
+        effect = (
+            "the points not reliable, and so is the scale, which comes from them"
+            if without_scale
+            else "the points not reliable"
+        )
         yield Finding(
             "points_noisy",
-            Severity.CAUTION,
-            f"The keypoints of these points are too noisy, and the points not reliable: {', '.join(names)}.",
+            Severity.SERIOUS if without_scale else Severity.CAUTION,
+            f"The keypoints of these points are too noisy, and {effect}: {', '.join(names)}.",
+            "Look at the videos with the keypoints drawn into them: does the detector follow these points?",
             points=names,
             figure=float(evidence.sigma_px.max()),
             limit=float(_USELESS_FOCAL_SHARE * focal),
             unit="px",
+            is_cause=without_scale,
         )
     if evidence.noise_mrad > _NOISY_MRAD:
         yield Finding(

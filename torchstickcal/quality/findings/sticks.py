@@ -20,6 +20,9 @@ _WORSE_END = 3.0
 """Noise of one end over that of the other."""
 _INSIDE_SHARE, _LEAST_LENGTHS = 0.7, 20
 """Share of lengths inside their 95 % intervals, below which the lengths contradict their own deviations."""
+_WRONG_SHARE = 0.5
+"""Share of lengths that are wrong by more than 6 standard deviations, from which on they are not those of a stick: 20 % at most
+in sound sessions."""
 
 
 @findings("sticks", "lengths that contradict each other, and a scale that little determines")
@@ -158,7 +161,21 @@ def _ends(evidence: Evidence) -> Iterator[Finding]:
 def _lengths(evidence: Evidence) -> Iterator[Finding]:
     """Lengths, predicted by cameras that did not see them, that contradict their own deviations."""
     for errors in evidence.acceptance.lengths if evidence.acceptance else ():
-        if errors.frames >= _LEAST_LENGTHS and errors.inside < _INSIDE_SHARE:
+        share = errors.wrong / max(1, errors.frames)
+        if errors.frames >= _LEAST_LENGTHS and share > _WRONG_SHARE:
+            yield Finding(
+                "stick_not_rigid",
+                Severity.SERIOUS,
+                f"{100 * share:.0f} % of the lengths of {errors.stick} in frames that took no part are wrong by more than 6 "
+                "standard deviations: what was detected as its ends does not keep its distance.",
+                "Look at the videos with the keypoints drawn into them: does the detector follow the ends of the stick?",
+                points=tuple(errors.stick.split(" - ")),
+                figure=share,
+                limit=_WRONG_SHARE,
+                unit="share",
+                is_cause=True,
+            )
+        elif errors.frames >= _LEAST_LENGTHS and errors.inside < _INSIDE_SHARE:
             yield Finding(
                 "lengths_outside",
                 Severity.CAUTION,
