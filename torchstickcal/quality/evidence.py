@@ -40,6 +40,8 @@ _MISFIT_SHARE, _MISFIT_LASTING = 0.92, 0.3
 """Share of a camera's keypoints that agree, over that of the median camera, below which, and correlation of its errors from
 frame to frame, beyond that of the median camera, above which it shows something else. Sound cameras have 0.97 and more, and
 differ by 0.1 at most. Mirrored and alien ones that fit at another place have 0.87 and less, and differ by 0.4 and more."""
+_EVIDENT = 1.5
+"""Evidence of a motion of a camera, over its limit, from which on it may be why the camera fits worse."""
 _NEAR_FOCAL = 0.3
 """Logarithm of an estimated or suggested over the given focal length: from here on, something else is wrong."""
 _FAR_SIGMAS = 5.0
@@ -166,7 +168,7 @@ class Evidence:
         if self.cameras < 3 or not bool(behind.any()):
             return torch.zeros_like(behind)
         behind &= self._lasting > self._lasting.median() + _MISFIT_LASTING
-        if bool(behind.any()) and self.motion is not None and self.motion.evidence > self.motion.least:
+        if bool(behind.any()) and self.motion is not None and self.motion.evidence > _EVIDENT * self.motion.least:
             behind[self.motion.camera] = False
         return behind
 
