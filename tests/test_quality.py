@@ -26,6 +26,7 @@ from torchstickcal.model.unknowns import all_unknowns
 from torchstickcal.quality.ends import change_at_end
 from torchstickcal.quality.evidence import Evidence, without_depth
 from torchstickcal.quality.findings.causes import _closer
+from torchstickcal.quality.findings.images import _off_centre
 from torchstickcal.quality.findings.unknowns import _all_focals, _contradicted, _different, _little_in_common
 from torchstickcal.quality.judge import _as_effects
 from torchstickcal.quality.lags import frames_are_apart
@@ -165,6 +166,19 @@ def test_a_camera_that_fits_worse_for_long_shows_something_else(
     evidence = evidence_of(calibration)
     assert evidence.misfits.tolist() == [alien and camera in worse for camera in range(5)]
     assert ("camera_alien" in codes(calibration.quality)) == alien
+
+
+@pytest.mark.parametrize(("lasting", "severity"), [(True, Severity.SERIOUS), (False, Severity.CAUTION)])
+def test_keypoints_off_centre_are_serious_where_errors_last(lasting: bool, severity: Severity):
+    given = session(cameras=3, frames=10).observations
+    found = SimpleNamespace(
+        off_centre=torch.tensor([False, True, False]),
+        errors_last_alone=torch.tensor([False, lasting, False]),
+        observations=given,
+        camera=given.camera_label,
+    )
+    (finding,) = _off_centre(cast("Evidence", found))
+    assert (finding.severity, finding.cameras) == (severity, ("cam02",))
 
 
 @pytest.mark.parametrize("turn_deg", [3.0, 6.0])

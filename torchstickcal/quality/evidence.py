@@ -36,7 +36,7 @@ _CONSISTENT_SHARE, _BEHIND_OTHERS, _NOISY_MRAD = 0.62, 0.85, 10.0
 whose cameras see one scene. Sound cameras keep 84 % and more, with 20 % of wrong keypoints 66 %."""
 DOUBTFUL_SHARE = 0.78
 """Share of a camera's keypoints that agree, below which it is doubted where the other cameras have more."""
-_MISFIT_SHARE, _MISFIT_LASTING = 0.92, 0.3
+_MISFIT_SHARE, _LASTING = 0.92, 0.3
 """Share of a camera's keypoints that agree, over that of the median camera, below which, and correlation of its errors from
 frame to frame, beyond that of the median camera, above which it shows something else. Sound cameras have 0.97 and more, and
 differ by 0.1 at most. Mirrored and alien ones that fit at another place have 0.87 and less, and differ by 0.4 and more."""
@@ -163,18 +163,17 @@ class Evidence:
     @cached_property
     def misfits(self) -> Tensor:
         """(C,), whether a camera seems to show something else than the others: fewer of its keypoints agree, and the errors of
-        those that do stay alike from frame to frame, while those of the other cameras do not. Not one that moved."""
+        those that do last. Not one that moved."""
         behind = self.agreement < _MISFIT_SHARE * self.agreement.median()
-        if self.cameras < 3 or not bool(behind.any()):
-            return torch.zeros_like(behind)
-        behind &= self._lasting > self._lasting.median() + _MISFIT_LASTING
+        if bool(behind.any()):
+            behind = behind & self.errors_last_alone
         if bool(behind.any()) and self.motion is not None and self.motion.evidence > _EVIDENT * self.motion.least:
             behind[self.motion.camera] = False
         return behind
 
-    @property
-    def _lasting(self) -> Tensor:
-        """(C,), correlation of a camera's residuals with those of the frame before."""
+    @cached_property
+    def errors_last_alone(self) -> Tensor:
+        """(C,), whether the errors of a camera stay alike from frame to frame, while those of the other cameras do not."""
         products, squares = torch.zeros(2, self.cameras, dtype=torch.float64, device=self.sigma_px.device)
         for _, errors, _ in self._errors_px:
             scaled = errors / self.sigma_px
@@ -182,7 +181,8 @@ class Evidence:
             both = (before != 0) & (after != 0)
             products += (before * after).flatten(1).sum(1)
             squares += (before.square() + after.square()).where(both, 0.0).flatten(1).sum(1) / 2
-        return products / squares.clamp_min(1e-9)
+        correlation = products / squares.clamp_min(1e-9)
+        return (correlation > correlation.median() + _LASTING) & (self.cameras > 2)
 
     @cached_property
     def set_aside_at_end(self) -> Tensor:
@@ -347,7 +347,8 @@ class Evidence:
         if found is None or found.evidence < found.least:
             return found
         slow = self._slow_changes(Explanation.by_motion(self.kept, self.state, found))
-        return found.beside(slow.variance, max(found.least, estimated(LEAST_EVIDENCE, slow.freedom)))
+        freedom = min(slow.freedom, 6.0 * (self.measurements.frames - 2))  # of the variances that the evidence is divided by
+        return found.beside(slow.variance, max(found.least, estimated(LEAST_EVIDENCE, freedom)))
 
     def slow_changes_beside(self, camera: int, focal_factor: float) -> SlowChanges:
         """How much the errors of single points change slowly, beside what another focal length of a camera explains."""

@@ -40,9 +40,9 @@ _IN_TIME_SHARE = 0.85
 _FITTING_SHARE = 0.95
 """The same at another time, from which on the camera shows the same thing then: others do similar things at other times. And
 where the camera seems to fit as given."""
-_MOVING_SHARE, _MOVING_SPREAD = 0.5, 0.05
+_MOVING_SHARE, _MOVING_SPREAD = 0.5, 0.015
 """Share of the keypoints of short parts that agree, each part at its own place, where a camera turns all the time, and how far
-these places are apart at most, as a share of the rig. What shows something else has 0.4 and places that differ by more."""
+these places are apart at most, as a share of the rig. What shows something else has 0.4, or places 0.02 apart and more."""
 _MOST_SUSPECTS = 4
 _SHARE_OF_NOISE = 0.1
 """Share of agreeing keypoints that is worth as much as noise smaller by the factor e."""

@@ -108,15 +108,20 @@ def _proportions(evidence: Evidence) -> Iterator[Finding]:
 
 
 def _off_centre(evidence: Evidence) -> Iterator[Finding]:
-    """Cameras whose keypoints lie where the images of their intrinsics are not."""
+    """Cameras whose keypoints lie where the images of their intrinsics are not: the more so where their errors last."""
     for camera in evidence.off_centre.nonzero().flatten().tolist():
         x, y = evidence.observations.cameras.matrix[camera, :2, 2].tolist()
-        name = evidence.camera(camera)
+        name, lasting = evidence.camera(camera), bool(evidence.errors_last_alone[camera])
         yield Finding(
             "keypoints_off_centre",
-            Severity.CAUTION,
+            Severity.SERIOUS if lasting else Severity.CAUTION,
             f"{name}: its keypoints lie to one side of the principal point of its intrinsics, ({x:.0f}, {y:.0f}), or far from "
-            "it, as where the intrinsics are those of images of another size.",
+            "it, as where the intrinsics are those of images of another size"
+            + (
+                ", and their errors stay alike from frame to frame, while those of the other cameras do not."
+                if lasting
+                else "."
+            ),
             "Check that the detector saw images of the size that the intrinsics are for.",
             cameras=(name,),
         )
