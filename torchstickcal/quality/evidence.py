@@ -171,6 +171,11 @@ class Evidence:
             behind[self.motion.camera] = False
         return behind
 
+    @property
+    def hidden(self) -> Tensor:
+        """(C,), whether a camera among three may show something else, though its keypoints agree: the points give way to it."""
+        return self.errors_last_alone & (self.cameras == 3)
+
     @cached_property
     def errors_last_alone(self) -> Tensor:
         """(C,), whether the errors of a camera stay alike from frame to frame, while those of the other cameras do not."""

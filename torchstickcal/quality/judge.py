@@ -53,7 +53,7 @@ def _worth_trying(evidence: Evidence, found: dict[Family, list[Finding]]) -> boo
         return True
     every = [finding for own in found.values() for finding in own]
     wrong = any(finding.severity >= Severity.SERIOUS or finding.code == "camera_doubtful" for finding in every)
-    wrong |= bool(evidence.misfits.any())
+    wrong |= bool((evidence.misfits | evidence.hidden).any())
     wrong |= evidence.cameras == 3 and evidence.noise_mrad > _NOISY_OF_THREE_MRAD
     explaining = [family for family, own in found.items() if any(finding.is_cause for finding in own)]
     serious = [family for family, own in found.items() if any(finding.severity >= Severity.SERIOUS for finding in own)]

@@ -79,6 +79,7 @@ def causes(evidence: Evidence) -> Iterator[Finding]:
     worse = bool(evidence.doubtful[camera]) or float(agreement[camera]) < _BEHIND_OTHERS * rest.share
     worse |= bool(evidence.set_aside_at_end[camera])
     noisy = evidence.noise_mrad > _NOISY_MRAD and rest.noise_mrad < _NOISE_RATIO * evidence.noise_mrad
+    noisy |= bool(evidence.hidden[camera])
     if rest.share < _SOUND_SHARE or not (worse or noisy or suspicious[camera]):
         return
     if (finding := _explained(evidence, camera, rest, 0.0 if noisy else float(evidence.agreement[camera]))) is not None:
