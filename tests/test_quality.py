@@ -168,6 +168,15 @@ def test_a_camera_that_fits_worse_for_long_shows_something_else(
     assert ("camera_alien" in codes(calibration.quality)) == alien
 
 
+@pytest.mark.parametrize(("camera", "sport", "seed"), [(2, "hockey", 20), (1, "kendo", 22)])
+def test_points_that_give_way_to_a_camera_among_three_are_an_effect(camera: int, sport: str, seed: int):
+    other = session(sport, cameras=3, frames=40, seed=seed).observations.keypoints
+    found = calibrate(with_camera(session(cameras=3, frames=40, seed=2).observations, camera, lambda _: other[camera])).quality
+    assert found.verdict is Verdict.POOR
+    assert codes(found)[0] == "camera_alien"
+    assert "points_noisy" in codes(found)
+
+
 @pytest.mark.parametrize(("lasting", "severity"), [(True, Severity.SERIOUS), (False, Severity.CAUTION)])
 def test_keypoints_off_centre_are_serious_where_errors_last(lasting: bool, severity: Severity):
     given = session(cameras=3, frames=10).observations

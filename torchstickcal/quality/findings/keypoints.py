@@ -155,7 +155,6 @@ def _noise(evidence: Evidence) -> Iterator[Finding]:
             figure=float(evidence.sigma_px.max()),
             limit=float(_USELESS_FOCAL_SHARE * focal),
             unit="px",
-            is_cause=without_scale,
         )
     if evidence.noise_mrad > _NOISY_MRAD:
         yield Finding(
