@@ -172,7 +172,7 @@ def test_a_camera_that_fits_worse_for_long_shows_something_else(
 def test_points_that_give_way_to_a_camera_among_three_are_an_effect(camera: int, sport: str, seed: int):
     other = session(sport, cameras=3, frames=40, seed=seed).observations.keypoints
     found = calibrate(with_camera(session(cameras=3, frames=40, seed=2).observations, camera, lambda _: other[camera])).quality
-    assert found.verdict is Verdict.POOR
+    assert found.verdict in (Verdict.POOR, Verdict.FAILED)
     assert codes(found)[0] == "camera_alien"
     assert "points_noisy" in codes(found)
 
