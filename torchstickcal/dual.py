@@ -37,8 +37,8 @@ def dual(value: Tensor, direction: Tensor) -> Tensor:
 
 def tangent(value: Tensor) -> Tensor:
     """The derivative that a dual number carries; zero if it carries none."""
-    dual = forward_ad.unpack_dual(value)
-    return torch.zeros_like(dual.primal) if dual.tangent is None else dual.tangent
+    parts = forward_ad.unpack_dual(value)
+    return torch.zeros_like(parts.primal) if parts.tangent is None else parts.tangent
 
 
 def _renew() -> None:

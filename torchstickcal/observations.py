@@ -22,7 +22,8 @@ point, such keypoints would: with errors and gradients that are larger the small
 _NO_CONFIDENCE = 1e-12
 """Confidence up to which a keypoint counts as not seen in any case: smaller numbers overflow when they are inverted."""
 _LEAST_REPEATED = 6
-"""Keypoints that a frame needs to be told from the frame before: a few, in whole pixels, are equal by chance."""
+"""Least number of keypoints of a frame that is called a copy of the frame before: fewer, in whole pixels, may be equal by
+chance."""
 _COEFFICIENTS = (4, 5, 8, 12, 14)
 _FISHEYE_COEFFICIENTS = (4,)
 _LARGEST_INTRINSIC = 1e9

@@ -1,4 +1,4 @@
-"""Vectors whose coordinates stand before their number: there torch's ``norm`` takes ten times as long as these."""
+"""Operations on many vectors that torch's own ``norm`` and products with columns take about ten times as long for."""
 
 from __future__ import annotations
 
@@ -26,3 +26,14 @@ def directions(vectors: Tensor, dim: int = 0) -> Tensor:
                 [0.8000, 0.0000]])
     """
     return vectors / lengths(vectors, dim).clamp_min(1e-12).unsqueeze(dim)
+
+
+def times_vectors(matrices: Tensor, vectors: Tensor) -> Tensor:
+    """Products (B, K) of matrices (B, K, n) and vectors (B, n).
+
+    Example:
+        >>> import torch
+        >>> times_vectors(torch.tensor([[[1.0, 2.0], [3.0, 4.0]]]), torch.tensor([[1.0, 1.0]]))
+        tensor([[3., 7.]])
+    """
+    return (vectors[:, None] @ matrices.mT)[:, 0]

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from torchstickcal.geometry.cameras import Intrinsics
-from torchstickcal.quality.resection import Resection, placed_at, resected
+from torchstickcal.quality.resection import Resection, at_later_frames, placed_at, resected
 
 _LEAST_FRAMES, _RUN_SHARE = 3, 0.9
 """Number of frames at an end that say why they were set aside, and their share of all frames that were set aside."""
@@ -77,10 +77,9 @@ def _explained(
     """Another time, by frames, or else another place of the camera."""
 
     def placed(later: int, moved: bool) -> Resection | None:
-        known = points.roll(-later, 1).isfinite().all(0) & keypoints.isfinite().all(-1) & chosen[:, None]
-        if later:
-            known[-later if later > 0 else 0 : None if later > 0 else -later] = False
-        seen = points.roll(-later, 1)[:, known], keypoints[known].mT, sigma_px.expand(known.shape)[known], camera
+        at_time = at_later_frames(points, later)
+        known = at_time.isfinite().all(0) & keypoints.isfinite().all(-1) & chosen[:, None]
+        seen = at_time[:, known], keypoints[known].mT, sigma_px.expand(known.shape)[known], camera
         return resected(*seen) if moved else placed_at(*seen, pose)
 
     at_times = {later: found for later in range(-_LATEST, _LATEST + 1) if later and (found := placed(later, False)) is not None}

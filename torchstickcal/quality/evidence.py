@@ -135,6 +135,16 @@ class Evidence:
         """The names of some cameras."""
         return ", ".join(map(self.camera, cameras))
 
+    def keypoints_of(self, camera: int) -> Tensor:
+        """(F, P, 2), the keypoints of a camera as they were given; NaN where not seen, and at exactly (0, 0)."""
+        seen = (self.observations.visible & ~self.observations.at_corner)[camera]
+        return self.observations.keypoints[camera].double().where(seen[..., None], torch.nan)
+
+    @property
+    def synchronous(self) -> bool:
+        """Whether the frames of all cameras were taken as they were given, one beside the other."""
+        return not self.ended.frames[0].apart and self.measurements.frames == self.observations.num_frames
+
     @cached_property
     def agreement(self) -> Tensor:
         """(C,), share of each camera's keypoints that agree with the other cameras; 1 where it has none. Those at exactly
@@ -202,16 +212,14 @@ class Evidence:
     @cached_property
     def changes_at_end(self) -> dict[int, ChangeAtEnd]:
         """By camera, why its frames at an end of the session were set aside, where that is known."""
-        other, frames = self.ended.labels.other_person[0], self.ended.frames[0]
-        if not bool(other.any()) or frames.apart or self.measurements.frames != self.observations.num_frames:
+        other = self.ended.labels.other_person[0]
+        if not bool(other.any()) or not self.synchronous:
             return {}
         found: dict[int, ChangeAtEnd] = {}
         for camera in other.any(1).nonzero().flatten().tolist():
-            seen = (self.observations.visible & ~self.observations.at_corner)[camera]
-            keypoints = self.observations.keypoints[camera].double().where(seen[..., None], torch.nan)
             pose = self.state.rotations[0, camera], self.state.translations[0, camera]
             own = self.measurements.cameras[0][camera : camera + 1]
-            change = change_at_end(other[camera], self.points, keypoints, self.sigma_px, own, pose)
+            change = change_at_end(other[camera], self.points, self.keypoints_of(camera), self.sigma_px, own, pose)
             if change is not None:
                 found[camera] = change
         return found

@@ -14,6 +14,7 @@ from torch import Tensor
 
 from torchstickcal.geometry.singular import covariance_root
 from torchstickcal.geometry.symmetric import IDENTITY, cholesky, forward
+from torchstickcal.geometry.vectors import times_vectors
 from torchstickcal.losses import ReprojectionLoss
 from torchstickcal.losses.robust import GemanMcClure
 from torchstickcal.model.measurements import Measurements
@@ -121,7 +122,7 @@ def _reduced(gradients: Tensor, blocks: Tensor, points: Tensor, seen: Tensor, pe
     force, moments = (forces.flatten(1, 3) @ homogeneous).view(*forces.shape[:-1], 4).split((1, 3), dim=-1)
     torque = torch.stack([moments[..., j, i] - moments[..., i, j] for i, j in ((1, 2), (2, 0), (0, 1))], dim=-1)
     direct = torch.cat([force[..., 0], torque], dim=-1)
-    pulls = direct[:, :, 0] - (solved[:, None] @ half.mT).view(len(half), -1, 6)
+    pulls = direct[:, :, 0] - times_vectors(half, solved).view(len(half), -1, 6)
     information = -half @ half.mT
     own = information.view(len(half), len(blocks), 6, len(blocks), 6).diagonal(dim1=1, dim2=3)
     own += direct[:, :, 1:].permute(0, 2, 3, 1)

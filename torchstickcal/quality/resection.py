@@ -86,6 +86,14 @@ def resected(
     return _compared(points, pixels, sigma_px, camera, (rotation, translation), moments)
 
 
+def at_later_frames(points: Tensor, later: int) -> Tensor:
+    """Points (3, F, P) some frames later, which may be fewer than 0; NaN where there is no such frame."""
+    moved = points.roll(-later, 1)
+    if later:
+        moved[:, -later if later > 0 else 0 : None if later > 0 else -later] = torch.nan
+    return moved
+
+
 def placed_at(
     points: Tensor, pixels: Tensor, sigma_px: Tensor, camera: Intrinsics, pose: tuple[Tensor, Tensor]
 ) -> Resection | None:

@@ -20,7 +20,7 @@ from torchstickcal.pipeline.adjust import adjust_cameras, begin
 from torchstickcal.pipeline.adjustment import Adjustment
 from torchstickcal.pipeline.run import Run
 from torchstickcal.quality.evidence import Evidence
-from torchstickcal.quality.resection import AGREEING_SIGMAS, LEAST_REACH, Resection, resected
+from torchstickcal.quality.resection import AGREEING_SIGMAS, LEAST_REACH, Resection, at_later_frames, resected
 
 _TRIAL_ITERATIONS = 20
 """Iterations of a stage of a trial at most: one that needs more explains nothing."""
@@ -143,12 +143,10 @@ class Rest:
             frames: that count.
             later: frames by which the camera's frames belong to later ones of the others.
         """
-        points = self.points.roll(-later, 1)
+        points = at_later_frames(self.points, later)
         usable = points.isfinite().all(0) & sight.keypoints.isfinite().all(-1)
         chosen = torch.zeros_like(usable)
         chosen[frames] = usable[frames]
-        if later:
-            chosen[-later if later > 0 else 0 : None if later > 0 else -later] = False
         sigma = self.sigma_px.expand(usable.shape)[chosen]
         placed = resected(points[:, chosen], sight.keypoints[chosen].mT, sigma, sight.camera)
         return None if placed is None else (placed, chosen)
@@ -161,7 +159,7 @@ def without(evidence: Evidence, camera: int) -> Rest | None:
         return None
     groups = evidence.config.camera_groups
     config = replace(evidence.config, camera_groups=[groups[other] for other in others] if groups else [])
-    observations = evidence.ended.labels.applied(evidence.observations) if _synchronous(evidence) else evidence.observations
+    observations = evidence.ended.labels.applied(evidence.observations) if evidence.synchronous else evidence.observations
     try:
         ended = tried(observations.of_cameras(others), config, evidence.ended.refined)
     except ObservationError:  # the others do not see a stick
@@ -191,18 +189,12 @@ def tried(
 def sight_of(evidence: Evidence, camera: int) -> Sight:
     """One camera as it was given, without keypoints at exactly (0, 0)."""
     observations = evidence.observations
-    seen = (observations.visible & ~observations.at_corner)[camera]
     size = observations.image_size
     return Sight(
-        observations.keypoints[camera].double().where(seen[..., None], torch.nan),
+        evidence.keypoints_of(camera),
         observations.cameras[camera : camera + 1],
         None if size is None else (size if size.ndim == 1 else size[camera]),
     )
-
-
-def _synchronous(evidence: Evidence) -> bool:
-    frames = evidence.ended.frames[0]
-    return not frames.apart and evidence.measurements.frames == evidence.observations.num_frames
 
 
 def shifted_share(rest: Rest, sight: Sight, rate_hz: float | None) -> tuple[int, float]:

@@ -74,5 +74,5 @@ def _definite(objective: Objective, state: State) -> NormalEquations:
 
 
 def _followed(system: NormalEquations, slopes: Gradient) -> State:
-    """The state at which slopes were found, with its points nearer to their minima."""
+    """The state at which the gradient was computed, after one step of its points towards their minima."""
     return replace(slopes.state, points=slopes.state.points - system.solve_points(slopes.point_gradient))

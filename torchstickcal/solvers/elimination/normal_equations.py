@@ -29,6 +29,7 @@ from torch import Tensor
 
 from torchstickcal.geometry import se3
 from torchstickcal.geometry.symmetric import DIAGONAL, IDENTITY, raised
+from torchstickcal.geometry.vectors import times_vectors
 from torchstickcal.losses.camera_point import CameraPointTerms, UnknownTerms
 from torchstickcal.model.objective import Objective
 from torchstickcal.model.state import State
@@ -227,7 +228,7 @@ class NormalEquations(Evaluated):
 
         def reduced_share(part: Part, eliminated: _EliminatedPart) -> Tensor:
             forward[part] = eliminated.elimination.forward_solve(point_rhs[..., part.columns])
-            return _times_vector(eliminated.solved_rows(self._points(part.columns)), forward[part])
+            return times_vectors(eliminated.solved_rows(self._points(part.columns)), forward[part])
 
         for share in self._of_parts(reduced_share) if self._free_cameras else ():
             reduced_rhs = reduced_rhs - share
@@ -375,7 +376,7 @@ class NormalEquations(Evaluated):
         rows = eliminated.solved_rows(self._points(part.columns))
         solved = eliminated.elimination.forward_solve(self.point_gradient[..., part.columns])
         kept = eliminated._replace(rows=rows) if keeps_rows else eliminated
-        return _PartTerms(images, sums, rows @ rows.mT, _times_vector(rows, solved), kept if keeps else None)
+        return _PartTerms(images, sums, rows @ rows.mT, times_vectors(rows, solved), kept if keeps else None)
 
     def _rig_hessian(self, sums: CameraSums) -> Tensor:
         """H_cc with the lens and clock unknowns and their prior, (B, 6 C' + K, 6 C' + K)."""
@@ -436,11 +437,6 @@ class NormalEquations(Evaluated):
 
     def _points(self, columns: Columns) -> Tensor:
         return self.state.points[..., columns].to(self.point_hessian.dtype)
-
-
-def _times_vector(rows: Tensor, vector: Tensor) -> Tensor:
-    """``W v`` (B, K) of matrices (B, K, n) and vectors (B, n). With columns, a batch takes eight times as long."""
-    return (vector[:, None] @ rows.mT)[:, 0]
 
 
 def _concatenate(tensors: Sequence[Tensor | None]) -> Any:
